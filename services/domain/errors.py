@@ -1,0 +1,87 @@
+"""Failures of the service, with a stable code, an HTTP status and whether trying again can help.
+
+Video errors (rows of `failures.parquet`) use the engine's codes of `vipe_core.errors` and, on top of them:
+`worker_died` (the process died on this video as often as allowed: quarantined), `video_timeout`, `input_unavailable`.
+"""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+
+class ServiceError(Exception):
+    """Base of every error that the service raises on purpose. The message is shown to the caller."""
+
+    code: ClassVar[str] = "service_error"
+    status: ClassVar[int] = 500
+    retryable: ClassVar[bool] = False
+
+
+class InvalidRequest(ServiceError):
+    code = "invalid_request"
+    status = 422
+
+
+class JobNotFound(ServiceError):
+    code = "job_not_found"
+    status = 404
+
+
+class InvalidPageToken(ServiceError):
+    code = "invalid_page_token"
+    status = 400
+
+
+class JobNotCancellable(ServiceError):
+    code = "job_not_cancellable"
+    status = 409
+
+
+class OutputInUse(ServiceError):
+    """The output location already belongs to another job."""
+
+    code = "output_in_use"
+    status = 409
+
+
+class IdempotencyConflict(ServiceError):
+    """The same `Idempotency-Key` came with another body."""
+
+    code = "idempotency_conflict"
+    status = 422
+
+
+class InputUnavailable(ServiceError):
+    """An input cannot be listed or fetched: it does not exist, or access is denied."""
+
+    code = "input_unavailable"
+    status = 422
+
+
+class StorageError(ServiceError):
+    """The object store refused or did not answer."""
+
+    code = "storage_error"
+    status = 503
+    retryable = True
+
+
+class ObjectMissing(StorageError):
+    """The key does not exist."""
+
+    code = "object_missing"
+    status = 404
+    retryable = False
+
+
+class CommitConflict(ServiceError):
+    """A commit record with another plan exists under this shard's name: two jobs share one output."""
+
+    code = "commit_conflict"
+    status = 409
+
+
+class IntegrityError(ServiceError):
+    """Stored bytes do not match their record."""
+
+    code = "integrity_error"

@@ -1,0 +1,309 @@
+"""The nouns of the service: jobs, shards, videos, leases and the commit record. Values only, no I/O."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import re
+from dataclasses import asdict, dataclass, field
+from datetime import datetime
+from typing import Any, Literal
+
+from services.domain.states import JobState, ShardState, VideoStatus
+
+Attribute = Literal["pose", "intrinsics", "depth", "rgb", "mask"]
+
+
+@dataclass(frozen=True, slots=True)
+class JobSpec:
+    """What the user asked for.
+
+    Attributes:
+        inputs: Each a directory, a video file, an `s3://bucket/key`, or an `s3://bucket/prefix/` (trailing slash).
+        output: A directory or `s3://bucket/prefix` that belongs to this job alone.
+        preset: Engine preset.
+        camera: Camera model.
+        attributes: Tars to write; `pose` and `intrinsics` always.
+        shard_max_videos: Most videos in one shard.
+        shard_max_input_bytes: Most input bytes in one shard (a stand-in for cost; one video always fits).
+        name: Free text for humans.
+    """
+
+    inputs: tuple[str, ...]
+    output: str
+    preset: str = "classical"
+    camera: str = "pinhole"
+    attributes: tuple[Attribute, ...] = ("pose", "intrinsics", "depth", "rgb")
+    shard_max_videos: int = 16
+    shard_max_input_bytes: int = 1 << 30
+    name: str = ""
+
+    @property
+    def config_hash(self) -> str:
+        """sha256 of what decides the payload bytes of a video, not of where they come from or go."""
+        config = {"preset": self.preset, "camera": self.camera, "attributes": list(self.attributes)}
+        return hashlib.sha256(json.dumps(config, sort_keys=True).encode()).hexdigest()
+
+    def to_json(self) -> dict[str, Any]:
+        return asdict(self)
+
+    @classmethod
+    def from_json(cls, data: dict[str, Any]) -> JobSpec:
+        return cls(**{**data, "inputs": tuple(data["inputs"]), "attributes": tuple(data["attributes"])})
+
+
+@dataclass(frozen=True, slots=True)
+class VideoRef:
+    """One input video.
+
+    Attributes:
+        key: Stable sample key `[a-z0-9_-]+`, the webdataset key and the artifact name; see `video_key`.
+        uri: Absolute path or `s3://` address.
+        size_bytes: As listed.
+        etag: Content tag of the listing where the store has one.
+    """
+
+    key: str
+    uri: str
+    size_bytes: int
+    etag: str | None = None
+
+
+def video_key(uri: str) -> str:
+    """Stable key of an input: its sanitised stem, then 8 hex of the address, so that equal stems never collide."""
+    stem = uri.rstrip("/").rsplit("/", 1)[-1].rsplit(".", 1)[0]
+    readable = re.sub(r"[^a-z0-9_-]+", "-", stem.lower()).strip("-")[:48] or "video"
+    return f"{readable}-{hashlib.sha256(uri.encode()).hexdigest()[:8]}"
+
+
+@dataclass(frozen=True, slots=True)
+class ShardPlan:
+    """Frozen membership of a shard. `plan_hash` binds a commit record to it."""
+
+    ordinal: int
+    videos: tuple[VideoRef, ...]
+
+    @property
+    def plan_hash(self) -> str:
+        members = [[v.key, v.uri, v.size_bytes, v.etag] for v in self.videos]
+        return hashlib.sha256(json.dumps([self.ordinal, members]).encode()).hexdigest()
+
+
+def shard_id(job_id: str, ordinal: int) -> str:
+    return f"{job_id}-{ordinal:06d}"
+
+
+@dataclass(frozen=True, slots=True)
+class JobProgress:
+    """Counters of a job, derived from its shards, videos and live leases.
+
+    Attributes:
+        frames_done: Frames of settled videos plus what live leases report.
+        frames_expected: Estimate of all frames; None until something is known.
+        frames_per_s: Over the recent past, 0 when idle.
+        eta_s: None when unknown.
+    """
+
+    shards_total: int = 0
+    shards_committed: int = 0
+    videos_total: int = 0
+    videos_succeeded: int = 0
+    videos_failed: int = 0
+    videos_quarantined: int = 0
+    frames_done: int = 0
+    frames_expected: int | None = None
+    frames_per_s: float = 0.0
+    eta_s: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Job:
+    id: str
+    spec: JobSpec
+    state: JobState
+    created_at: datetime
+    updated_at: datetime
+    tenant: str = "default"
+    error_code: str | None = None
+    error_message: str | None = None
+    planned: bool = False
+    started_at: datetime | None = None
+    finished_at: datetime | None = None
+    progress: JobProgress = field(default_factory=JobProgress)
+
+
+@dataclass(frozen=True, slots=True)
+class Lease:
+    """The right to work on one shard, until it expires.
+
+    Attributes:
+        fence: Grows with every lease of the shard; a smaller fence has lost.
+        attempt: 1 for the first lease.
+        spent: Video key -> worker deaths already blamed on it.
+    """
+
+    job_id: str
+    shard_id: str
+    ordinal: int
+    plan_hash: str
+    videos: tuple[VideoRef, ...]
+    spec: JobSpec
+    attempt: int
+    fence: int
+    holder: str
+    expires_at: datetime
+    spent: dict[str, int] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class LeaseProgress:
+    """What a holder reports when it renews."""
+
+    fence: int
+    shard_id: str
+    video_key: str | None = None
+    stage: str | None = None
+    videos_done: int = 0
+    frames_done: int = 0
+    frames_expected: int | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Renewal:
+    """The store's answer to a renewal: go on, or stop and why."""
+
+    shard_id: str
+    verdict: Literal["continue", "lost", "cancel"]
+
+
+@dataclass(frozen=True, slots=True)
+class VideoResult:
+    """One row of the dataset index. Everything but the first four is None where the video failed.
+
+    Attributes:
+        error_message: One line that names the input and says what to do.
+        camera_params: Source-resolution parameters, half-pixel convention.
+        quality: `Quality.summary()` of the engine.
+        timings_s: Seconds per stage.
+        source: What the probe found (codec, pixel format, rotation, size).
+    """
+
+    key: str
+    uri: str
+    status: VideoStatus
+    attempt: int
+    error_code: str | None = None
+    error_message: str | None = None
+    num_frames: int | None = None
+    num_keyframes: int | None = None
+    width: int | None = None
+    height: int | None = None
+    fps: float | None = None
+    duration_s: float | None = None
+    camera_model: str | None = None
+    camera_params: tuple[float, ...] | None = None
+    fov_x_deg: float | None = None
+    trajectory_length: float | None = None
+    scale: str | None = None
+    depth_kind: str | None = None
+    quality: dict[str, Any] | None = None
+    seconds: float | None = None
+    timings_s: dict[str, float] | None = None
+    source: dict[str, Any] | None = None
+    provenance: dict[str, Any] | None = None
+
+    def to_json(self) -> dict[str, Any]:
+        return asdict(self)
+
+    @classmethod
+    def from_json(cls, data: dict[str, Any]) -> VideoResult:
+        params = data.get("camera_params")
+        return cls(
+            **{
+                **data,
+                "status": VideoStatus(data["status"]),
+                "camera_params": None if params is None else tuple(params),
+            }
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class PayloadObject:
+    """One uploaded tar.
+
+    Attributes:
+        key: Object key relative to the output root, attempt-unique.
+        members: Sample key -> member name -> (offset, size) of the data in the tar, so that one video can be range-read.
+    """
+
+    attribute: Attribute
+    key: str
+    size_bytes: int
+    sha256: str
+    members: dict[str, dict[str, tuple[int, int]]]
+
+
+@dataclass(frozen=True, slots=True)
+class CommitRecord:
+    """The one create-once object that makes a shard exist. Readers trust nothing else."""
+
+    job_id: str
+    shard_id: str
+    ordinal: int
+    plan_hash: str
+    config_hash: str
+    attempt: int
+    fence: int
+    holder: str
+    tar_name: str | None
+    objects: tuple[PayloadObject, ...]
+    videos: tuple[VideoResult, ...]
+    schema_version: int = 1
+
+    @property
+    def frames(self) -> int:
+        return sum(v.num_frames or 0 for v in self.videos)
+
+    def to_bytes(self) -> bytes:
+        return (json.dumps(asdict(self), sort_keys=True, indent=1) + "\n").encode()
+
+    @classmethod
+    def from_bytes(cls, data: bytes) -> CommitRecord:
+        raw = json.loads(data)
+        objects = tuple(
+            PayloadObject(
+                **{
+                    **o,
+                    "members": {
+                        sample: {name: (int(offset), int(size)) for name, (offset, size) in files.items()}
+                        for sample, files in o["members"].items()
+                    },
+                }
+            )
+            for o in raw["objects"]
+        )
+        return cls(**{**raw, "objects": objects, "videos": tuple(VideoResult.from_json(v) for v in raw["videos"])})
+
+
+@dataclass(frozen=True, slots=True)
+class Event:
+    """One line of a job's history; `seq` grows over the whole store."""
+
+    seq: int
+    job_id: str
+    at: datetime
+    kind: str
+    data: dict[str, Any]
+
+
+@dataclass(frozen=True, slots=True)
+class Shard:
+    id: str
+    job_id: str
+    ordinal: int
+    state: ShardState
+    num_videos: int
+    attempts: int
+    holder: str | None = None
+    lease_expires_at: datetime | None = None
+    tar_name: str | None = None

@@ -1,0 +1,125 @@
+"""The store's contract: the truth of intent. One function per transition, one transaction and one event each.
+
+Implemented once with SQLAlchemy for SQLite and PostgreSQL. All methods are synchronous and thread-safe. Times are the
+database's clock, UTC.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+from services.domain.models import (
+    CommitRecord,
+    Event,
+    Job,
+    JobSpec,
+    Lease,
+    LeaseProgress,
+    Renewal,
+    Shard,
+    ShardPlan,
+    VideoRef,
+    VideoResult,
+)
+from services.domain.states import JobState, VideoStatus
+
+
+@dataclass(frozen=True, slots=True)
+class VideoRow:
+    """A video of a job as the store knows it; `result` once its shard is committed."""
+
+    ref: VideoRef
+    shard_id: str
+    status: VideoStatus
+    result: VideoResult | None
+
+
+class Store(Protocol):
+    # Jobs -----------------------------------------------------------------------------------------------------------
+    def create_job(
+        self, spec: JobSpec, *, tenant: str = "default", idempotency_key: str | None = None
+    ) -> tuple[Job, bool]:
+        """A new queued job and True; or, for a known key with the same spec, that job and False.
+
+        Raises:
+            IdempotencyConflict: The key was used with another spec.
+            OutputInUse: A job that is not failed or cancelled has the same output.
+        """
+
+    def get_job(self, job_id: str) -> Job:
+        """With progress. Raises JobNotFound."""
+
+    def list_jobs(
+        self, *, limit: int = 50, after: str | None = None, state: JobState | None = None
+    ) -> tuple[list[Job], str | None]:
+        """Newest first, and the cursor of the next page."""
+
+    def request_cancel(self, job_id: str) -> Job:
+        """Move to cancelling (a job without live leases is cancelled at once). Raises JobNotCancellable when ended."""
+
+    # Planning -------------------------------------------------------------------------------------------------------
+    def next_unplanned(self) -> Job | None:
+        """The oldest job that is queued, or running with planning unfinished."""
+
+    def begin_planning(self, job_id: str) -> bool:
+        """Move queued -> running. False if the job is no longer plannable (cancelled meanwhile)."""
+
+    def add_shards(self, job_id: str, shards: Iterable[ShardPlan]) -> None:
+        """Add planned shards with their videos; ordinals that exist are left as they are, so planning can be redone."""
+
+    def finish_planning(self, job_id: str) -> None: ...
+
+    def fail_job(self, job_id: str, code: str, message: str) -> None: ...
+
+    # Leases ---------------------------------------------------------------------------------------------------------
+    def claim(self, holder: str, *, limit: int, ttl_s: float) -> list[Lease]:
+        """Lease pending shards, oldest job first. Fence and attempt grow by one with each lease of a shard."""
+
+    def renew(self, holder: str, progress: Sequence[LeaseProgress], *, ttl_s: float) -> list[Renewal]:
+        """Extend leases in bulk and learn which to stop."""
+
+    def holds(self, shard_id: str, fence: int) -> bool:
+        """Whether this lease is still the shard's current one (checked just before the commit point)."""
+
+    def blame(self, shard_id: str, fence: int, video_key: str, reason: str) -> int:
+        """Count a worker death against a video; returns its deaths so far. Survives the lease."""
+
+    def release(self, shard_id: str, fence: int, reason: str) -> None:
+        """Give a lease back: the shard is pending again (or cancelled, if its job is being cancelled)."""
+
+    def record_commit(self, record: CommitRecord) -> bool:
+        """Mark a shard committed from its record. Idempotent; False if it was committed already."""
+
+    def expire_leases(self) -> int:
+        """Requeue shards whose lease ran out; settle cancelling jobs that hold no lease any more."""
+
+    # Finalising -----------------------------------------------------------------------------------------------------
+    def next_finalizable(self) -> Job | None:
+        """A planned running job whose shards are all settled (moved to finalizing), or one already finalizing."""
+
+    def finish_job(self, job_id: str) -> Job:
+        """Finalizing -> succeeded, or succeeded_with_errors if any video failed."""
+
+    # Reading --------------------------------------------------------------------------------------------------------
+    def list_videos(
+        self, job_id: str, *, status: VideoStatus | None = None, limit: int = 100, after: str | None = None
+    ) -> tuple[list[VideoRow], str | None]: ...
+
+    def list_shards(
+        self, job_id: str, *, limit: int = 100, after: str | None = None
+    ) -> tuple[list[Shard], str | None]: ...
+
+    def uncommitted_shards(self, job_id: str) -> list[Shard]:
+        """Shards that are not committed, for the reconciler that compares with the records in object storage."""
+
+    def events(self, job_id: str, *, after_seq: int = 0, limit: int = 1000) -> list[Event]: ...
+
+    def counts(self) -> dict[str, dict[str, int]]:
+        """{"jobs": {state: n}, "shards": {state: n}} for the gauges."""
+
+    def ping(self) -> None:
+        """Raises if the database does not answer."""
+
+    def close(self) -> None: ...

@@ -1,0 +1,1 @@
+"""Dense bundle adjustment: the problem, its plan, and its solvers."""

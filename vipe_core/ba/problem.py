@@ -1,0 +1,198 @@
+"""What a bundle adjustment is asked: measurements, state, what is free, and how the answer comes back.
+
+Solver-independent. One `Problem` is a graph of directed edges between frames. Edge e = (i -> j) measures, for every
+cell p of the source grid, where the point behind p is seen in frame j:
+
+    r_e(p) = project(G_j G_i^-1 (ray(p), d_i(p)); K) - target_e(p)        weighted per component by weight_e(p)
+
+with G = cam_from_world and d the inverse depth along the ray that the camera model returns (z = 1 for pinhole).
+Units: pixels of the working image (integer pixel indices), inverse depth in 1 / world unit.
+Paper section 3.2, equations of the dense term and of the depth prior; see also `plan.py` for how it is solved.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from enum import StrEnum
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from vipe_core.cameras import CameraModel
+
+RobustKernel = Literal["none", "huber", "cauchy", "geman_mcclure"]
+
+
+@dataclass(frozen=True, slots=True)
+class Grid:
+    """The cells of a frame that carry an inverse depth.
+
+    Cell (row y, column x) samples the working image at index coordinates (x * stride + offset, y * stride + offset).
+    """
+
+    height: int
+    width: int
+    stride: float = 8.0
+    offset: float = 3.5
+
+    @property
+    def num_cells(self) -> int:
+        return self.height * self.width
+
+    def sample_px(self, dtype: torch.dtype = torch.float64, device: torch.device | str = "cpu") -> Tensor:
+        """(P, 2) index coordinates (u, v) of all cells, row-major."""
+        v, u = torch.meshgrid(
+            torch.arange(self.height, dtype=dtype, device=device) * self.stride + self.offset,
+            torch.arange(self.width, dtype=dtype, device=device) * self.stride + self.offset,
+            indexing="ij",
+        )
+        return torch.stack((u.reshape(-1), v.reshape(-1)), dim=-1)
+
+
+@dataclass(frozen=True, slots=True)
+class Edges:
+    """Directed measurements, in any order.
+
+    Attributes:
+        source: (E,) int64 frame that owns the inverse depth.
+        target: (E,) int64 frame that the points are seen in; differs from `source`.
+        target_px: (E, P, 2) float32 measured index coordinates in the target frame.
+        weight: (E, P, 2) float32 inverse variance of u and v, 1/px^2; 0 is no measurement.
+    """
+
+    source: Tensor
+    target: Tensor
+    target_px: Tensor
+    weight: Tensor
+
+    def __post_init__(self) -> None:
+        num_edges = len(self.source)
+        if (
+            self.target.shape != (num_edges,)
+            or self.target_px.shape != self.weight.shape
+            or (self.target_px.ndim != 3 or self.target_px.shape[0] != num_edges or self.target_px.shape[2] != 2)
+        ):
+            raise ValueError(
+                "edges disagree in shape: "
+                f"{self.source.shape = }, {self.target.shape = }, {self.target_px.shape = }, {self.weight.shape = }"
+            )
+
+
+@dataclass(frozen=True, slots=True)
+class State:
+    """The unknowns.
+
+    Attributes:
+        cam_from_world: (N, 4, 4) float64 rigid transforms.
+        inverse_depth: (N, P) float32 or float64, positive.
+        intrinsics: (K,) float64, `Camera.index_params` of the working image: (fx, fy, cx, cy[, alpha]).
+    """
+
+    cam_from_world: Tensor
+    inverse_depth: Tensor
+    intrinsics: Tensor
+
+
+@dataclass(frozen=True, slots=True)
+class Free:
+    """What may move.
+
+    Attributes:
+        poses: (N,) bool. At least one pose must be fixed unless there is nothing else to hold the gauge.
+        inverse_depth: (N,) bool, per frame.
+        focal: Whether the focal length moves (fx and fy by the same factor; log-parametrised).
+        distortion: Whether alpha of the unified model moves.
+    """
+
+    poses: Tensor
+    inverse_depth: Tensor
+    focal: bool = False
+    distortion: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Priors:
+    """Soft knowledge, each with its own information (inverse variance).
+
+    Attributes:
+        inverse_depth: (N, P) prior value, or None.
+        inverse_depth_weight: (N, P) information of that prior; 0 where there is none.
+        log_focal: Prior of log(fx), or None.
+        log_focal_sigma: Its standard deviation.
+    """
+
+    inverse_depth: Tensor | None = None
+    inverse_depth_weight: Tensor | None = None
+    log_focal: float | None = None
+    log_focal_sigma: float = 1.0
+
+
+@dataclass(frozen=True, slots=True)
+class Problem:
+    """One bundle adjustment. Frames that no edge touches are left as they are."""
+
+    camera_model: CameraModel
+    grid: Grid
+    edges: Edges
+    free: Free
+    priors: Priors = field(default_factory=Priors)
+
+
+@dataclass(frozen=True, slots=True)
+class Options:
+    """How to solve it: Levenberg-Marquardt that accepts only a lower robust cost.
+
+    Attributes:
+        max_iterations: Upper bound of accepted plus rejected steps.
+        relative_tolerance: Stop when an accepted step lowers the cost by less than this share.
+        robust: Kernel on the 2-norm of the residual in pixels.
+        robust_scale_px: Its scale c.
+        initial_damping: First LM damping of the (scaled) reduced system.
+        min_inverse_depth: Lower clamp of inverse depth after a step, relative to the median of the problem's.
+        max_inverse_depth: Upper clamp, likewise.
+        min_depth_ratio: A measurement counts only where the transformed homogeneous z exceeds this (z starts at 1).
+    """
+
+    max_iterations: int = 10
+    relative_tolerance: float = 1e-4
+    robust: RobustKernel = "geman_mcclure"
+    robust_scale_px: float = 3.0
+    initial_damping: float = 1e-4
+    min_inverse_depth: float = 1e-3
+    max_inverse_depth: float = 1e3
+    min_depth_ratio: float = 0.1
+
+
+class Status(StrEnum):
+    """Why a solve ended. Failures return the state of the last accepted step, never a silent zero step."""
+
+    CONVERGED = "converged"
+    MAX_ITERATIONS = "max_iterations"
+    NO_PROGRESS = "no_progress"  # damping ran out without a lower cost: already at a minimum
+    SINGULAR = "singular"  # the reduced system was not positive definite at the largest damping
+    NON_FINITE = "non_finite"  # the input state or measurements hold NaN or infinity
+    EMPTY = "empty"  # nothing is free, or no edge has a weight
+
+
+@dataclass(frozen=True, slots=True)
+class Result:
+    """The answer.
+
+    Attributes:
+        state: New state, same shapes and dtypes as the input.
+        status: Why it ended.
+        iterations: Steps tried.
+        initial_cost: Robust cost before, sum of weight * rho, px^2.
+        cost: Robust cost after.
+        weight_sum: Sum of the weights of valid measurements at the end; `cost / weight_sum` is a mean squared residual.
+        log_focal_sigma: 1-sigma of log(f) from the reduced system at the end; NaN when the focal length was fixed.
+    """
+
+    state: State
+    status: Status
+    iterations: int
+    initial_cost: float
+    cost: float
+    weight_sum: float
+    log_focal_sigma: float = float("nan")

@@ -1,0 +1,5 @@
+"""Camera models: one value type, and the projection functions of each model."""
+
+from vipe_core.cameras.camera import Camera, CameraModel
+
+__all__ = ["Camera", "CameraModel"]

@@ -1,0 +1,87 @@
+"""The camera as a value: a model's name, its parameters and the image size they belong to.
+
+Pixel convention. `Camera` uses half-pixel centres: the image spans [0, W] x [0, H], the sample of pixel index (i, j)
+lies at (i + 0.5, j + 0.5), and a centred principal point is (W/2, H/2). So a resize multiplies all four numbers by the
+same ratios. Code that works with integer pixel indices (optical flow, the BA grid, remap) takes `index_params`, the
+only place where the half pixel is subtracted. Disk formats store the half-pixel numbers, as the paper does.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vipe_core.errors import ConfigError
+
+CameraModel = Literal["pinhole", "mei", "equirect"]
+
+_NUM_PARAMS: dict[str, int] = {"pinhole": 4, "mei": 5, "equirect": 0}
+
+
+@dataclass(frozen=True, slots=True)
+class Camera:
+    """A camera model with its parameters.
+
+    Attributes:
+        model: `pinhole`, `mei` (the unified model) or `equirect`.
+        params: `pinhole` (fx, fy, cx, cy); `mei` (fx, fy, cx, cy, alpha); `equirect` (). Pixels, half-pixel centres.
+        width: Image width that `params` belong to, pixels.
+        height: Image height, pixels.
+
+    Raises:
+        ConfigError: Unknown model, wrong number of parameters, or a focal length that is not positive.
+    """
+
+    model: CameraModel
+    params: tuple[float, ...]
+    width: int
+    height: int
+
+    def __post_init__(self) -> None:
+        expected = _NUM_PARAMS.get(self.model)
+        if expected is None:
+            raise ConfigError(f"unknown camera model {self.model!r}; known: {', '.join(_NUM_PARAMS)}")
+        if len(self.params) != expected:
+            raise ConfigError(f"camera {self.model!r} takes {expected} parameters, got {self.params!r}")
+        if expected and not (self.params[0] > 0 and self.params[1] > 0 and all(map(math.isfinite, self.params))):
+            raise ConfigError(f"camera parameters must be finite with a positive focal length, got {self.params!r}")
+
+    @classmethod
+    def pinhole_from_fov(cls, fov_x_deg: float, width: int, height: int) -> Camera:
+        """Centred pinhole with square pixels and the given horizontal field of view."""
+        focal_px = width / 2 / math.tan(math.radians(fov_x_deg) / 2)
+        return cls("pinhole", (focal_px, focal_px, width / 2, height / 2), width, height)
+
+    @property
+    def focal_px(self) -> float:
+        """Horizontal focal length in pixels; NaN for `equirect`."""
+        return self.params[0] if self.params else math.nan
+
+    @property
+    def fov_x_deg(self) -> float:
+        """Angle between the left and right edge rays through the centre row, degrees."""
+        if self.model == "equirect":
+            return 360.0
+        alpha = self.params[4] if self.model == "mei" else 0.0
+        m = self.width / 2 / self.params[0]
+        eta = (alpha + math.sqrt(max(0.0, 1 + (1 - alpha * alpha) * m * m))) / (1 + m * m)
+        return math.degrees(2 * math.atan2(eta * m, eta - alpha))
+
+    def index_params(self) -> NDArray[np.float64]:
+        """`params` as float64 for integer pixel indices: cx and cy are half a pixel smaller."""
+        params = np.array(self.params, dtype=np.float64)
+        if len(params):
+            params[2:4] -= 0.5
+        return params
+
+    def resized(self, width: int, height: int) -> Camera:
+        """The same camera for an image resized (not cropped) to `width` x `height`."""
+        sx, sy = width / self.width, height / self.height
+        if not self.params:
+            return Camera(self.model, (), width, height)
+        fx, fy, cx, cy, *rest = self.params
+        return Camera(self.model, (fx * sx, fy * sy, cx * sx, cy * sy, *rest), width, height)

@@ -1,0 +1,115 @@
+"""Every failure of the engine, with a stable code.
+
+    VipeError
+    ├── InputError            the video (or image directory) is the cause
+    │   ├── MediaNotFound         media_not_found
+    │   ├── EmptyMedia            media_empty
+    │   ├── CorruptMedia          media_corrupt
+    │   ├── NoVideoStream         no_video_stream
+    │   ├── UnsupportedMedia      media_unsupported
+    │   └── MediaTooLarge         media_too_large
+    ├── DecodeError           the decoder child is the cause
+    │   ├── DecodeTimeout         decode_timeout      (retryable)
+    │   └── DecodeCrashed         decode_crashed      (retryable)
+    ├── ConfigError           invalid_config          a preset, camera or device that does not exist
+    ├── WeightsMissing        weights_missing         a preset needs network weights that are not here
+    ├── FormatError           format_error            an artifact on disk does not hold what it must
+    └── EngineError           engine_failed           a stage could not finish; always a defect of ours
+
+Codes are part of the public interface: they are stored in databases and
+parquet files and never change their meaning. The message names the input and
+says what to do; it never holds more than one line of another library's text.
+"""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+
+class VipeError(Exception):
+    """Base of every error that the engine raises on purpose.
+
+    Attributes:
+        code: Stable machine-readable code.
+        retryable: Whether the same input can succeed on another attempt.
+    """
+
+    code: ClassVar[str] = "vipe_error"
+    retryable: ClassVar[bool] = False
+
+    @property
+    def message(self) -> str:
+        return str(self)
+
+
+class InputError(VipeError):
+    """The input itself is the cause; another attempt gives the same error."""
+
+    code = "input_error"
+
+
+class MediaNotFound(InputError):
+    code = "media_not_found"
+
+
+class EmptyMedia(InputError):
+    """A zero-byte file, an empty directory, or a stream that holds no frame."""
+
+    code = "media_empty"
+
+
+class CorruptMedia(InputError):
+    """Not a media container at all, or one whose contents cannot be decoded."""
+
+    code = "media_corrupt"
+
+
+class NoVideoStream(InputError):
+    """A media file without pictures, such as an audio file."""
+
+    code = "no_video_stream"
+
+
+class UnsupportedMedia(InputError):
+    """A container, codec or pixel format outside of what the engine opens."""
+
+    code = "media_unsupported"
+
+
+class MediaTooLarge(InputError):
+    """More pixels or frames than the configured limits allow."""
+
+    code = "media_too_large"
+
+
+class DecodeError(VipeError):
+    code = "decode_error"
+    retryable = True
+
+
+class DecodeTimeout(DecodeError):
+    """The decoder made no progress within its wall-clock budget and was killed."""
+
+    code = "decode_timeout"
+
+
+class DecodeCrashed(DecodeError):
+    """The decoder process died (a signal, or out of memory)."""
+
+    code = "decode_crashed"
+
+
+class ConfigError(VipeError):
+    code = "invalid_config"
+
+
+class WeightsMissing(VipeError):
+    code = "weights_missing"
+
+
+class FormatError(VipeError):
+    code = "format_error"
+
+
+class EngineError(VipeError):
+    code = "engine_failed"

@@ -1,0 +1,1 @@
+"""What the pipeline asks of a component, and the families that provide it."""

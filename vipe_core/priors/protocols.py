@@ -1,0 +1,100 @@
+"""One protocol per role. A preset names a provider for each; the pipeline knows only these.
+
+All images are uint8 working images (see `WorkingFrame`); all pixel coordinates are integer-index coordinates of them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vipe_core.ba.problem import Grid
+from vipe_core.cameras import Camera
+
+Array = NDArray[Any]
+
+
+@dataclass(frozen=True, slots=True)
+class WorkingFrame:
+    """A frame resized to the working resolution of the SLAM stage.
+
+    Attributes:
+        index: Frame index in the video.
+        gray: (h, w) uint8.
+        rgb: (h, w, 3) uint8.
+        valid: (h, w) bool, False on pixels that must not be used (a user's mask, a moving object), or None.
+    """
+
+    index: int
+    gray: NDArray[np.uint8]
+    rgb: NDArray[np.uint8]
+    valid: NDArray[np.bool_] | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Match:
+    """A dense measurement from one frame to another, sampled at the cells of a grid (row-major, P cells).
+
+    Attributes:
+        target_px: (P, 2) float32 where each source cell is seen in the target.
+        weight: (P, 2) float32 inverse variance in 1/px^2 per component; 0 where there is no measurement.
+        consistent: Share of in-bounds cells that pass the forward-backward check, 0..1.
+    """
+
+    target_px: NDArray[np.float32]
+    weight: NDArray[np.float32]
+    consistent: float
+
+
+class DenseMatcher(Protocol):
+    """Dense matching between working frames (paper: the DROID update operator; here any provider)."""
+
+    def encode(self, frame: WorkingFrame) -> Any:
+        """Per-frame features, computed once and kept with the keyframe."""
+
+    def motion_px(self, source: Any, target: Any) -> float:
+        """Cheap median displacement over textured cells, in pixels: the motion filter's score."""
+
+    def match(self, source: Any, target: Any, guess_px: Array | None = None) -> tuple[Match, Match]:
+        """Measurements source -> target and target -> source.
+
+        Args:
+            source: Features of `encode`.
+            target: Features of `encode`.
+            guess_px: (P, 2) where the current estimate sees the source cells in the target; the starting point of the
+                refinement, or None.
+        """
+
+    def match_fast(self, source: Any, target: Any, guess_px: Array | None = None) -> Match:
+        """Cheaper one-way measurement for posing frames between keyframes."""
+
+
+class SparseTracker(Protocol):
+    """Corner tracks between two frames, already splatted to the grid (paper: the sparse term)."""
+
+    def match(self, source: Any, target: Any, dense: Match) -> Match:
+        """Measurements at the cells that hold a track; weight 0 elsewhere. `dense` guides the search."""
+
+
+@dataclass(frozen=True, slots=True)
+class IntrinsicsEstimate:
+    """An initial camera with how far it can be trusted.
+
+    Attributes:
+        camera: At the working resolution.
+        log_focal_sigma: Standard deviation of log(f): about 0.05 for a sure estimate, 0.3 for a default.
+        num_pairs: Number of frame pairs behind it; 0 means a default was taken.
+    """
+
+    camera: Camera
+    log_focal_sigma: float
+    num_pairs: int
+
+
+class IntrinsicsInit(Protocol):
+    def estimate(self, frames: Sequence[WorkingFrame], grid: Grid) -> IntrinsicsEstimate:
+        """Estimate the camera from frames spread over the clip (in time order, consecutive runs allowed)."""

@@ -1,0 +1,62 @@
+"""The contract between the engine and whatever holds the frames."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+@dataclass(frozen=True, slots=True)
+class VideoInfo:
+    """What is known before decoding. Sizes are of the upright picture, after rotation metadata.
+
+    Attributes:
+        num_frames_hint: Frame count as the container states it, or None; decoding has the last word.
+        fps: Average frame rate (30 for a directory of images).
+        rotation_deg: Clockwise rotation that was applied to make the picture upright: 0, 90, 180 or 270.
+    """
+
+    name: str
+    path: str
+    width: int
+    height: int
+    fps: float
+    num_frames_hint: int | None
+    duration_s: float | None
+    rotation_deg: int
+    codec: str
+    pixel_format: str
+    size_bytes: int
+
+
+@dataclass(frozen=True, slots=True)
+class Frame:
+    """One decoded picture.
+
+    Attributes:
+        index: 0, 1, 2 ... in presentation order.
+        timestamp_s: Presentation time from the container, strictly increasing; index / fps for images.
+        rgb: (height, width, 3) uint8, upright.
+    """
+
+    index: int
+    timestamp_s: float
+    rgb: NDArray[np.uint8]
+
+
+class FrameSource(Protocol):
+    """Frames of one video, in bounded memory: every call decodes again what it needs."""
+
+    @property
+    def info(self) -> VideoInfo: ...
+
+    def frames(self, size: tuple[int, int] | None = None, start: int = 0, stop: int | None = None) -> Iterator[Frame]:
+        """Frames [start, stop) in order, area-resized to `size` = (width, height) if given.
+
+        Raises:
+            InputError, DecodeError: typed, naming the input. Closing the iterator early kills the decoder.
+        """
