@@ -1,0 +1,169 @@
+"""Every metric of the service, declared in one place.
+
+Names follow the Prometheus guide: one prefix, base units, bounded label values. No label ever holds a video, an
+address, a process or free text. A process makes one `Metrics` and hands it to the parts that emit; embedded, the API
+and the agent share it, so that one `/metrics` page tells everything.
+"""
+
+from __future__ import annotations
+
+import platform
+from collections.abc import Mapping
+from importlib.metadata import PackageNotFoundError, version
+from typing import TYPE_CHECKING
+
+from prometheus_client import (
+    CONTENT_TYPE_LATEST,
+    CollectorRegistry,
+    Counter,
+    Gauge,
+    Histogram,
+    ProcessCollector,
+    generate_latest,
+    start_http_server,
+)
+
+from services.domain.models import VideoResult
+from services.domain.states import JobState, ShardState, VideoStatus
+
+if TYPE_CHECKING:
+    from threading import Thread
+    from wsgiref.simple_server import WSGIServer
+
+CONTENT_TYPE = CONTENT_TYPE_LATEST
+"""The media type of `Metrics.render()`."""
+
+_STAGE_BUCKETS_S = (0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0, 20.0, 40.0, 80.0, 160.0, 320.0, 640.0, 1280.0)
+_REQUEST_BUCKETS_S = (0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0)
+
+
+class Metrics:
+    """Typed handles on the service's metrics.
+
+    Args:
+        registry: Where to register; a new one, with this process's CPU, memory and file handles, when omitted.
+    """
+
+    def __init__(self, registry: CollectorRegistry | None = None) -> None:
+        if registry is None:
+            registry = CollectorRegistry()
+            ProcessCollector(registry=registry)
+        self.registry = registry
+
+        # The store's view. Every process that reports them reports the same value: aggregate with max, not sum.
+        self.jobs = Gauge("vipe_jobs", "Jobs in the store by state.", ["state"], registry=registry)
+        self.shards = Gauge("vipe_shards", "Shards in the store by state.", ["state"], registry=registry)
+
+        # Work done by this process.
+        self.videos = Counter(
+            "vipe_videos_total",
+            "Videos settled by a committed shard, by outcome and stable error code.",
+            ["outcome", "error_class"],
+            registry=registry,
+        )
+        self.frames = Counter("vipe_frames_total", "Annotated frames in committed shards.", registry=registry)
+        self.stage_duration = Histogram(
+            "vipe_stage_duration_seconds",
+            "Wall time of a stage: fetch and the engine's own per video; pack and commit per shard; finalise per job.",
+            ["stage"],
+            buckets=_STAGE_BUCKETS_S,
+            registry=registry,
+        )
+        self.quarantined_videos = Gauge(
+            "vipe_quarantined_videos",
+            "Videos quarantined by this process because they kept killing the worker.",
+            registry=registry,
+        )
+
+        # Leases and commits.
+        self.lease_expired = Counter(
+            "vipe_lease_expired_total", "Leases that ran out and were requeued.", registry=registry
+        )
+        self.lease_renew_failures = Counter(
+            "vipe_lease_renew_failures_total",
+            "Renewals that failed: the store did not answer, or it said that the lease is lost.",
+            registry=registry,
+        )
+        self.commit_conflicts = Counter(
+            "vipe_commit_conflicts_total",
+            "Commits that found something in their way: `lost` to another attempt, `fenced` before the commit point, "
+            "`foreign` record of another plan.",
+            ["result"],
+            registry=registry,
+        )
+
+        # Actors.
+        self.actor_restarts = Counter(
+            "vipe_actor_restarts_total",
+            "Worker processes replaced, by reason: died, video_timeout, unresponsive, start_failed.",
+            ["reason"],
+            registry=registry,
+        )
+        self.actors = Gauge(
+            "vipe_actors",
+            "Worker slots by role and state: starting, idle, busy, fenced.",
+            ["role", "state"],
+            registry=registry,
+        )
+
+        # Object storage, as seen by the agent and its workers.
+        self.object_store_bytes = Counter(
+            "vipe_object_store_bytes_total", "Bytes moved to and from object storage.", ["op"], registry=registry
+        )
+        self.object_store_requests = Counter(
+            "vipe_object_store_requests_total",
+            "Operations on object storage by outcome: ok, missing, exists, error.",
+            ["op", "status"],
+            registry=registry,
+        )
+
+        # API.
+        self.api_request_duration = Histogram(
+            "vipe_api_request_duration_seconds",
+            "Time to answer an HTTP request, by route template.",
+            ["route", "method", "status"],
+            buckets=_REQUEST_BUCKETS_S,
+            registry=registry,
+        )
+
+        self.build_info = Gauge(
+            "vipe_build_info", "Always 1; the labels tell what runs.", ["version", "python"], registry=registry
+        )
+        self.build_info.labels(version=package_version(), python=platform.python_version()).set(1)
+
+    def set_counts(self, counts: Mapping[str, Mapping[str, int]]) -> None:
+        """Publish `Store.counts()`; a state that the store does not mention is 0, not stale."""
+        for job_state in JobState:
+            self.jobs.labels(state=job_state.value).set(counts.get("jobs", {}).get(job_state.value, 0))
+        for shard_state in ShardState:
+            self.shards.labels(state=shard_state.value).set(counts.get("shards", {}).get(shard_state.value, 0))
+
+    def observe_video(self, result: VideoResult) -> None:
+        """Count one video of a shard that this process committed."""
+        self.videos.labels(outcome=result.status.value, error_class=result.error_code or "").inc()
+        if result.status is VideoStatus.QUARANTINED:
+            self.quarantined_videos.inc()
+        if result.num_frames and result.status is VideoStatus.SUCCEEDED:
+            self.frames.inc(result.num_frames)
+        for stage, seconds in (result.timings_s or {}).items():
+            self.stage_duration.labels(stage=stage).observe(seconds)
+
+    def render(self) -> bytes:
+        """The Prometheus text page, of type `CONTENT_TYPE`."""
+        return generate_latest(self.registry)
+
+    def serve(self, port: int, host: str = "127.0.0.1") -> tuple[WSGIServer, Thread]:
+        """Answer `GET /metrics` from a daemon thread, for an agent without the API beside it.
+
+        Args:
+            port: 0 picks a free one; read it from `server.server_port`.
+        """
+        return start_http_server(port, addr=host, registry=self.registry)
+
+
+def package_version() -> str:
+    """The installed version of this distribution."""
+    try:
+        return version("vipe-cluster")
+    except PackageNotFoundError:  # Imported from a checkout that was never installed.
+        return "unknown"
