@@ -1,0 +1,70 @@
+"""What a video is, before it is decoded: `probe` opens it in a killable child and decodes one picture."""
+
+from __future__ import annotations
+
+import stat
+from pathlib import Path
+
+from vipe_core.errors import EmptyMedia, MediaNotFound, UnsupportedMedia
+from vipe_core.video.limits import Limits
+from vipe_core.video.naming import sanitise_name
+from vipe_core.video.process import DecoderProcess
+from vipe_core.video.source import VideoInfo
+from vipe_core.video.wire import Request
+
+PROBE_BUDGET_S = 60.0
+
+
+def file_size_bytes(path: Path) -> int:
+    """Size of a regular, non-empty, readable file.
+
+    Raises:
+        MediaNotFound: No such file, or no permission to read it.
+        UnsupportedMedia: A pipe, a device or a socket.
+        EmptyMedia: Zero bytes.
+    """
+    try:
+        status = path.stat()
+        if stat.S_ISREG(status.st_mode):
+            path.open("rb").close()
+    except OSError as error:
+        raise MediaNotFound(f"{path.name}: {error.strerror or 'cannot be opened'}; check the path") from error
+    if not stat.S_ISREG(status.st_mode):
+        raise UnsupportedMedia(f"{path.name}: not a regular file; provide a video file or a directory of images")
+    if status.st_size == 0:
+        raise EmptyMedia(f"{path.name}: the file has zero bytes; check that the upload is complete")
+    return status.st_size
+
+
+def probe(
+    path: str | Path, *, limits: Limits | None = None, name: str | None = None, budget_s: float = PROBE_BUDGET_S
+) -> VideoInfo:
+    """Describe a video file.
+
+    Args:
+        path: A regular file. It is opened with the `file` protocol and self-contained containers only.
+        limits: Bounds on picture size and length; the defaults of `Limits` if None.
+        name: Name of the sequence; the sanitised stem if None.
+        budget_s: Wall seconds after which the child is killed.
+
+    Raises:
+        InputError: MediaNotFound, EmptyMedia, CorruptMedia, NoVideoStream, UnsupportedMedia or MediaTooLarge.
+        DecodeTimeout, DecodeCrashed: The child hangs or died.
+    """
+    path = Path(path)
+    size_bytes = file_size_bytes(path)
+    request = Request(
+        task="probe",
+        paths=(str(path.absolute()),),
+        images=False,
+        limits=limits or Limits(),
+        size=None,
+        start=0,
+        stop=None,
+        fps=0.0,
+        threads=1,
+        stall_s=budget_s,
+    )
+    with DecoderProcess(request, path.name, stall_s=budget_s, wall_s=budget_s) as child:
+        info = child.document()["info"]
+    return VideoInfo(name=name or sanitise_name(path.stem), path=str(path), size_bytes=size_bytes, **info)

@@ -1,0 +1,190 @@
+"""The parent's side of a decoder process: start it, read its messages with a stall limit, always kill and reap it."""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import json
+import os
+import selectors
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import IO, Any
+
+import numpy as np
+
+from vipe_core.errors import DecodeCrashed, DecodeError, DecodeTimeout
+from vipe_core.video.source import Frame
+from vipe_core.video.wire import (
+    DOCUMENT,
+    HEADER_BYTES,
+    HEARTBEAT,
+    MAX_DOCUMENT_BYTES,
+    Header,
+    Request,
+    raise_error_document,
+)
+
+_PACKAGE_ROOT = Path(__file__).resolve().parents[2]
+_PIPE_BYTES = 1 << 20
+
+
+class DecoderProcess:
+    """One decoder child, as a context manager; leaving it kills the child's process group and reaps it.
+
+    Args:
+        request: What to do.
+        label: Name of the input for messages.
+        stall_s: Seconds to wait for the next message. Time that the caller spends between reads does not count.
+        wall_s: Total seconds allowed from start to end, or None.
+    """
+
+    def __init__(self, request: Request, label: str, stall_s: float, wall_s: float | None = None) -> None:
+        self._label = label
+        self._stall_s = stall_s
+        self._deadline_s = None if wall_s is None else time.monotonic() + wall_s
+        self._resources = contextlib.ExitStack()
+        self._errors: IO[bytes] = self._resources.enter_context(tempfile.TemporaryFile())
+        read_fd, write_fd = os.pipe()
+        self._resources.callback(os.close, read_fd)
+        try:
+            self._process = subprocess.Popen(
+                # -P: the working directory is no place to import from.
+                [sys.executable, "-P", "-m", "vipe_core.video.decoder_child", request.to_json(), str(write_fd)],
+                stdin=subprocess.PIPE,
+                stdout=subprocess.DEVNULL,
+                stderr=self._errors,
+                pass_fds=(write_fd,),
+                start_new_session=True,
+                env=_child_environment(),
+            )
+        except BaseException:
+            self._resources.close()
+            raise
+        finally:
+            os.close(write_fd)
+        self._fd = read_fd
+        with contextlib.suppress(OSError):
+            # A larger pipe means fewer switches; an unprivileged user may have used up the allowance.
+            fcntl.fcntl(read_fd, fcntl.F_SETPIPE_SZ, _PIPE_BYTES)
+        os.set_blocking(read_fd, False)
+        self._selector = self._resources.enter_context(selectors.DefaultSelector())
+        self._selector.register(read_fd, selectors.EVENT_READ)
+
+    @property
+    def pid(self) -> int:
+        return self._process.pid
+
+    def __enter__(self) -> DecoderProcess:
+        return self
+
+    def __exit__(self, *exc_info: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Kill the child and everything it started, wait for it, release the pipe. Safe to call twice."""
+        if self._fd < 0:
+            return
+        with contextlib.suppress(ProcessLookupError, PermissionError):
+            os.killpg(self._process.pid, signal.SIGKILL)
+        self._process.wait()
+        if self._process.stdin is not None:
+            self._process.stdin.close()
+        self._fd = -1
+        self._resources.close()
+
+    def document(self) -> dict[str, Any]:
+        """The one JSON document of a `probe`.
+
+        Raises:
+            InputError, DecodeError: As the child reports, or because it hangs or died.
+        """
+        while True:
+            header = self._header()
+            if header.kind == DOCUMENT:
+                return self._read_document(header)
+            if header.kind != HEARTBEAT:
+                raise DecodeError(f"{self._label}: the decoder process sent an unexpected message; try again")
+
+    def frames(self) -> Iterator[Frame | dict[str, Any]]:
+        """Frames as they arrive, and last the closing document.
+
+        Raises:
+            InputError, DecodeError: As the child reports, or because it hangs or died.
+        """
+        while True:
+            header = self._header()
+            if header.kind == DOCUMENT:
+                yield self._read_document(header)
+                return
+            if header.kind == HEARTBEAT:
+                continue
+            rgb = np.empty((header.height, header.width, 3), dtype=np.uint8)
+            if rgb.nbytes != header.payload_bytes:
+                raise DecodeError(f"{self._label}: the decoder process sent a picture of the wrong size; try again")
+            self._fill(rgb.data.cast("B"))
+            yield Frame(header.index, header.timestamp_s, rgb)
+
+    def _header(self) -> Header:
+        raw = bytearray(HEADER_BYTES)
+        self._fill(memoryview(raw))
+        return Header.unpack(raw)
+
+    def _read_document(self, header: Header) -> dict[str, Any]:
+        if header.payload_bytes > MAX_DOCUMENT_BYTES:
+            raise DecodeError(f"{self._label}: the decoder process sent an oversized document; try again")
+        raw = bytearray(header.payload_bytes)
+        self._fill(memoryview(raw))
+        document: dict[str, Any] = json.loads(raw)
+        raise_error_document(document)
+        return document
+
+    def _fill(self, view: memoryview) -> None:
+        while view:
+            try:
+                count = os.readv(self._fd, [view])
+            except BlockingIOError:
+                self._wait()
+                continue
+            if count == 0:
+                raise self._crash()
+            view = view[count:]
+
+    def _wait(self) -> None:
+        timeout_s = self._stall_s
+        if self._deadline_s is not None:
+            timeout_s = min(timeout_s, self._deadline_s - time.monotonic())
+        if timeout_s <= 0 or not self._selector.select(timeout_s):
+            self.close()
+            raise DecodeTimeout(
+                f"{self._label}: the decoder made no progress in time and was killed; try again or re-encode the video"
+            )
+
+    def _crash(self) -> DecodeCrashed:
+        try:
+            code = self._process.wait(timeout=5)
+        except subprocess.TimeoutExpired:
+            code = None
+        self._errors.seek(0, os.SEEK_END)
+        self._errors.seek(max(0, self._errors.tell() - 4096))
+        lines = self._errors.read().decode(errors="replace").strip().splitlines()
+        reason = f" ({lines[-1].strip()[:200]})" if lines else ""
+        if code is not None and code < 0:
+            how = f"was killed by signal {signal.Signals(-code).name}"
+        else:
+            how = f"ended with status {code}"
+        return DecodeCrashed(f"{self._label}: the decoder process {how}{reason}; try again or re-encode the video")
+
+
+def _child_environment() -> dict[str, str]:
+    environment = dict(os.environ)
+    inherited = environment.get("PYTHONPATH")
+    environment["PYTHONPATH"] = f"{_PACKAGE_ROOT}{os.pathsep}{inherited}" if inherited else str(_PACKAGE_ROOT)
+    # The child does no linear algebra: thread pools would only slow its start.
+    environment.update(OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1")
+    return environment

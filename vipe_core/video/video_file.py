@@ -1,0 +1,102 @@
+"""Frames of a video file, decoded in a killable child process."""
+
+from __future__ import annotations
+
+import logging
+import os
+from collections.abc import Iterator
+from pathlib import Path
+
+from vipe_core.video.limits import Limits
+from vipe_core.video.probe import PROBE_BUDGET_S, probe
+from vipe_core.video.process import DecoderProcess
+from vipe_core.video.source import Frame, VideoInfo
+from vipe_core.video.wire import Request
+
+_LOG = logging.getLogger(__name__)
+
+STALL_S = 60.0
+
+
+def default_threads() -> int:
+    """Decoder threads: enough to keep up with the engine, few enough to share the machine."""
+    return max(1, min(4, len(os.sched_getaffinity(0))))
+
+
+class VideoFileSource:
+    """`FrameSource` over one video file.
+
+    Every iterator owns one child process; it ends when the iterator is exhausted, closed or garbage collected. A range
+    that does not start at 0 decodes and discards what lies before, because only that numbers frames exactly in every
+    container. A file that is damaged or cut short gives the pictures that are whole, and says so in `damage`.
+
+    Args:
+        path: Video file.
+        limits: Bounds on picture size and length.
+        name: Name of the sequence; the sanitised stem if None.
+        stall_s: Seconds without a decoded frame after which the child is killed (DecodeTimeout).
+        threads: Decoder threads.
+
+    Raises:
+        InputError, DecodeError: From `probe`.
+    """
+
+    def __init__(
+        self,
+        path: str | Path,
+        *,
+        limits: Limits | None = None,
+        name: str | None = None,
+        stall_s: float = STALL_S,
+        threads: int | None = None,
+    ) -> None:
+        self._limits = limits or Limits()
+        self._stall_s = stall_s
+        self._threads = threads or default_threads()
+        self._path = Path(path).absolute()
+        self._info = probe(path, limits=self._limits, name=name, budget_s=max(stall_s, PROBE_BUDGET_S))
+        self._damage: str | None = None
+
+    @property
+    def info(self) -> VideoInfo:
+        return self._info
+
+    @property
+    def damage(self) -> str | None:
+        """What was wrong with the file, in one sentence; None before a pass has reached the end, or if nothing was."""
+        return self._damage
+
+    def frames(self, size: tuple[int, int] | None = None, start: int = 0, stop: int | None = None) -> Iterator[Frame]:
+        """See `FrameSource.frames`."""
+        check_range(size, start, stop)
+        if stop is not None and stop <= start:
+            return
+        request = Request(
+            task="decode",
+            paths=(str(self._path),),
+            images=False,
+            limits=self._limits,
+            size=size,
+            start=start,
+            stop=stop,
+            fps=self._info.fps,
+            threads=self._threads,
+            stall_s=self._stall_s,
+        )
+        with DecoderProcess(request, self._path.name, self._stall_s) as child:
+            for item in child.frames():
+                if isinstance(item, Frame):
+                    yield item
+                elif item.get("damage") and self._damage is None:
+                    self._damage = str(item["damage"])
+                    _LOG.warning("%s: %s; the whole pictures are used", self._path.name, self._damage)
+
+
+def check_range(size: tuple[int, int] | None, start: int, stop: int | None) -> None:
+    """Raises:
+    ValueError: A size that is not positive, or a negative frame number.
+    """
+    if size is not None and min(size) < 1:
+        raise ValueError(f"size must be positive, got {size}")
+    if start < 0 or (stop is not None and stop < 0):
+        raise ValueError(f"frame numbers must not be negative, got [{start}, {stop})")
