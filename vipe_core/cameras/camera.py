@@ -10,12 +10,15 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from vipe_core.errors import ConfigError
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 CameraModel = Literal["pinhole", "mei", "equirect"]
 
@@ -72,11 +75,56 @@ class Camera:
         return math.degrees(2 * math.atan2(eta * m, eta - alpha))
 
     def index_params(self) -> NDArray[np.float64]:
-        """`params` as float64 for integer pixel indices: cx and cy are half a pixel smaller."""
+        """What `projection` takes, float64, for integer pixel indices.
+
+        `params` with cx and cy half a pixel smaller; (width, height) for `equirect`, which has no others.
+        """
+        if self.model == "equirect":
+            return np.array((self.width, self.height), dtype=np.float64)
         params = np.array(self.params, dtype=np.float64)
-        if len(params):
-            params[2:4] -= 0.5
+        params[2:4] -= 0.5
         return params
+
+    @classmethod
+    def from_index_params(cls, model: CameraModel, params: ArrayLike, width: int, height: int) -> Camera:
+        """Inverse of `index_params`."""
+        values = [float(value) for value in np.asarray(params, dtype=np.float64)]
+        if model == "equirect":
+            return cls(model, (), width, height)
+        values[2] += 0.5
+        values[3] += 0.5
+        return cls(model, tuple(values), width, height)
+
+    def unproject(self, px: ArrayLike) -> NDArray[np.float64]:
+        """(..., 2) index coordinates -> (..., 3) float64 rays: z = 1 for `pinhole`, unit length otherwise."""
+        from vipe_core.cameras import projection  # here, so that a camera without pixels needs no torch
+
+        pixels = np.array(px, dtype=np.float64)
+        rays = projection.unproject(self.model, self._tensor(self.index_params()), self._tensor(pixels))
+        return np.asarray(rays.numpy())
+
+    def project(self, points: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+        """(..., 3) points in the camera frame -> (..., 2) float64 index coordinates, (...) whether they are imaged.
+
+        A pixel outside of the image is valid; one behind a pinhole camera is not.
+        """
+        from vipe_core.cameras import projection
+
+        xyz = np.array(points, dtype=np.float64)
+        px, valid = projection.project(self.model, self._tensor(self.index_params()), self._tensor(xyz))
+        return np.asarray(px.numpy()), np.asarray(valid.numpy())
+
+    def rays(self, height: int | None = None, width: int | None = None) -> NDArray[np.float64]:
+        """(height, width, 3) float64 rays of all pixels of the image resized to that size (default: its own size)."""
+        camera = self.resized(width or self.width, height or self.height)
+        v, u = np.meshgrid(np.arange(camera.height), np.arange(camera.width), indexing="ij")
+        return camera.unproject(np.stack((u, v), axis=-1))
+
+    @staticmethod
+    def _tensor(values: NDArray[np.float64]) -> Tensor:
+        import torch
+
+        return torch.from_numpy(values)
 
     def resized(self, width: int, height: int) -> Camera:
         """The same camera for an image resized (not cropped) to `width` x `height`."""
