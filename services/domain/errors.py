@@ -27,6 +27,11 @@ class JobNotFound(ServiceError):
     status = 404
 
 
+class ShardNotFound(ServiceError):
+    code = "shard_not_found"
+    status = 404
+
+
 class InvalidPageToken(ServiceError):
     code = "invalid_page_token"
     status = 400
@@ -34,6 +39,13 @@ class InvalidPageToken(ServiceError):
 
 class JobNotCancellable(ServiceError):
     code = "job_not_cancellable"
+    status = 409
+
+
+class InvalidTransition(ServiceError):
+    """The job is in a state from which this step does not exist."""
+
+    code = "invalid_transition"
     status = 409
 
 
@@ -72,6 +84,14 @@ class ObjectMissing(StorageError):
     code = "object_missing"
     status = 404
     retryable = False
+
+
+class StoreUnavailable(ServiceError):
+    """The database does not answer, or stayed locked for longer than its patience."""
+
+    code = "store_unavailable"
+    status = 503
+    retryable = True
 
 
 class CommitConflict(ServiceError):

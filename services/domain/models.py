@@ -102,6 +102,7 @@ class JobProgress:
         frames_expected: Estimate of all frames; None until something is known.
         frames_per_s: Over the recent past, 0 when idle.
         eta_s: None when unknown.
+        videos_done: Settled videos plus what live leases report; a video is settled when its shard is committed.
     """
 
     shards_total: int = 0
@@ -114,6 +115,7 @@ class JobProgress:
     frames_expected: int | None = None
     frames_per_s: float = 0.0
     eta_s: float | None = None
+    videos_done: int = 0
 
 
 @dataclass(frozen=True, slots=True)

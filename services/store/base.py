@@ -84,13 +84,22 @@ class Store(Protocol):
         """Whether this lease is still the shard's current one (checked just before the commit point)."""
 
     def blame(self, shard_id: str, fence: int, video_key: str, reason: str) -> int:
-        """Count a worker death against a video; returns its deaths so far. Survives the lease."""
+        """Count a worker death against a video; returns its deaths so far. Survives the lease.
+
+        A lease that is not current any more has no say: nothing is counted then.
+        """
 
     def release(self, shard_id: str, fence: int, reason: str) -> None:
         """Give a lease back: the shard is pending again (or cancelled, if its job is being cancelled)."""
 
     def record_commit(self, record: CommitRecord) -> bool:
-        """Mark a shard committed from its record. Idempotent; False if it was committed already."""
+        """Mark a shard committed from its record. Idempotent; False if it was committed already.
+
+        The record in object storage is the commit point, so the store follows it even if the lease ran out meanwhile.
+
+        Raises:
+            CommitConflict: The record has another plan, or a fence that was never given out.
+        """
 
     def expire_leases(self) -> int:
         """Requeue shards whose lease ran out; settle cancelling jobs that hold no lease any more."""
@@ -104,8 +113,15 @@ class Store(Protocol):
 
     # Reading --------------------------------------------------------------------------------------------------------
     def list_videos(
-        self, job_id: str, *, status: VideoStatus | None = None, limit: int = 100, after: str | None = None
-    ) -> tuple[list[VideoRow], str | None]: ...
+        self,
+        job_id: str,
+        *,
+        status: VideoStatus | None = None,
+        error_code: str | None = None,
+        limit: int = 100,
+        after: str | None = None,
+    ) -> tuple[list[VideoRow], str | None]:
+        """In the order of their keys, and the cursor of the next page."""
 
     def list_shards(
         self, job_id: str, *, limit: int = 100, after: str | None = None

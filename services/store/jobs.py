@@ -1,0 +1,253 @@
+"""Transitions of jobs: creation, planning, cancellation, the end."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import posixpath
+from collections.abc import Iterable
+from datetime import datetime, timedelta
+from typing import Any
+
+from sqlalchemy import Row, func, insert, select, update
+from ulid import ULID
+
+from services.domain.errors import IdempotencyConflict, InvalidTransition, JobNotCancellable, JobNotFound, OutputInUse
+from services.domain.events import EventKind, job_event
+from services.domain.models import JobSpec, ShardPlan, shard_id
+from services.domain.states import JOB_TRANSITIONS, JobState, ShardState, VideoStatus
+from services.store.database import Tx
+from services.store.schema import idempotency_keys, jobs, shards, videos
+
+# Serialises the creation of jobs in PostgreSQL, so that ids grow and the check of the output cannot be overtaken.
+_CREATE_LOCK = 0x6A6F6273
+
+
+def lock_job(tx: Tx, job_id: str) -> Row[Any]:
+    """Read a job's row for a change. Whoever changes a job's shards or counters takes this lock first.
+
+    It is the lock that lets rows refer to the job meanwhile (`FOR NO KEY UPDATE`): a claim, which locks shards only,
+    can write its event.
+    """
+    row = tx.first(select(jobs).where(jobs.c.id == job_id).with_for_update(key_share=True))
+    if row is None:
+        raise JobNotFound(f"there is no job {job_id!r}")
+    return row
+
+
+def move_job(tx: Tx, job: Row[Any], to: JobState, *, event_data: dict[str, Any] | None = None, **columns: Any) -> None:
+    """Take one step of the job's state machine and write its event."""
+    if to not in JOB_TRANSITIONS[JobState(job.state)]:
+        raise InvalidTransition(f"job {job.id} is {job.state}: it cannot become {to.value}")
+    if to.terminal:
+        columns["finished_at"] = tx.now
+    tx.run(update(jobs).where(jobs.c.id == job.id).values(state=to.value, updated_at=tx.now, **columns))
+    tx.emit(job.id, job_event(to), **(event_data or {}))
+
+
+def settle_cancelling(tx: Tx, job_id: str) -> None:
+    """Cancelling -> cancelled as soon as no shard of the job is leased."""
+    job = lock_job(tx, job_id)
+    if JobState(job.state) is not JobState.CANCELLING:
+        return
+    leased = select(shards.c.id).where(shards.c.job_id == job_id, shards.c.state == ShardState.LEASED)
+    if tx.first(leased.limit(1)) is None:
+        move_job(tx, job, JobState.CANCELLED)
+
+
+def canonical_output(output: str) -> str:
+    """One spelling per location, so that two jobs cannot own it under two names."""
+    if output.startswith("s3://"):
+        bucket, _, prefix = output.removeprefix("s3://").partition("/")
+        return f"s3://{bucket}/{prefix.strip('/')}".rstrip("/")
+    return posixpath.normpath(output)
+
+
+def create_job(tx: Tx, spec: JobSpec, tenant: str, idempotency_key: str | None) -> tuple[str, bool]:
+    """See `Store.create_job`; gives the id."""
+    if tx.conn.dialect.name == "postgresql":
+        tx.run(select(func.pg_advisory_xact_lock(_CREATE_LOCK)))
+    document = spec.to_json()
+    spec_hash = hashlib.sha256(json.dumps(document, sort_keys=True).encode()).hexdigest()
+    if idempotency_key is not None:
+        known = tx.first(
+            select(idempotency_keys).where(
+                idempotency_keys.c.tenant == tenant, idempotency_keys.c.key == idempotency_key
+            )
+        )
+        if known is not None:
+            if known.spec_hash != spec_hash:
+                raise IdempotencyConflict(
+                    f"Idempotency-Key {idempotency_key!r} was used with another request; use a new key"
+                )
+            return known.job_id, False
+    output = canonical_output(spec.output)
+    owner = tx.first(
+        select(jobs.c.id, jobs.c.state).where(
+            jobs.c.output == output, jobs.c.state.not_in([JobState.FAILED, JobState.CANCELLED])
+        )
+    )
+    if owner is not None:
+        raise OutputInUse(f"output {spec.output!r} belongs to job {owner.id} ({owner.state}); choose another output")
+
+    job_id = _next_id(tx)
+    tx.run(
+        insert(jobs).values(
+            id=job_id,
+            tenant=tenant,
+            spec=document,
+            output=output,
+            state=JobState.QUEUED.value,
+            created_at=tx.now,
+            updated_at=tx.now,
+        )
+    )
+    if idempotency_key is not None:
+        tx.run(
+            insert(idempotency_keys).values(
+                tenant=tenant, key=idempotency_key, spec_hash=spec_hash, job_id=job_id, created_at=tx.now
+            )
+        )
+    tx.emit(job_id, EventKind.JOB_QUEUED, name=spec.name)
+    return job_id, True
+
+
+def _next_id(tx: Tx) -> str:
+    """A ULID of the database's clock, later than every other: jobs sort by age also within one tick of the clock."""
+    moment: datetime = tx.now
+    newest = tx.run(select(func.max(jobs.c.id))).scalar_one()
+    if newest is not None:
+        moment = max(moment, ULID.from_str(newest.removeprefix("job_")).datetime + timedelta(milliseconds=1))
+    return f"job_{ULID.from_datetime(moment)}"
+
+
+def request_cancel(tx: Tx, job_id: str) -> None:
+    """See `Store.request_cancel`."""
+    job = lock_job(tx, job_id)
+    state = JobState(job.state)
+    if state is JobState.CANCELLING:
+        return
+    if JobState.CANCELLING not in JOB_TRANSITIONS[state]:
+        raise JobNotCancellable(f"job {job_id} is {state.value}: it cannot be cancelled any more")
+    move_job(tx, job, JobState.CANCELLING)
+    _cancel_pending(tx, job_id)
+    settle_cancelling(tx, job_id)
+
+
+def begin_planning(tx: Tx, job_id: str) -> bool:
+    """See `Store.begin_planning`."""
+    job = lock_job(tx, job_id)
+    state = JobState(job.state)
+    if state is JobState.QUEUED:
+        move_job(tx, job, JobState.RUNNING, started_at=tx.now)
+        return True
+    return state is JobState.RUNNING and not job.planned
+
+
+def add_shards(tx: Tx, job_id: str, plans: Iterable[ShardPlan]) -> None:
+    """See `Store.add_shards`. Adds nothing to a job that is not being planned any more."""
+    job = lock_job(tx, job_id)
+    if JobState(job.state) is not JobState.RUNNING or job.planned:
+        return
+    wanted = {plan.ordinal: plan for plan in plans}
+    known = set(
+        tx.run(select(shards.c.ordinal).where(shards.c.job_id == job_id, shards.c.ordinal.in_(list(wanted)))).scalars()
+    )
+    new = [plan for ordinal, plan in sorted(wanted.items()) if ordinal not in known]
+    if not new:
+        return
+    tx.run(
+        insert(shards),
+        [
+            {
+                "id": shard_id(job_id, plan.ordinal),
+                "job_id": job_id,
+                "ordinal": plan.ordinal,
+                "state": ShardState.PENDING.value,
+                "plan_hash": plan.plan_hash,
+                "num_videos": len(plan.videos),
+                "input_bytes": sum(v.size_bytes for v in plan.videos),
+            }
+            for plan in new
+        ],
+    )
+    tx.run(
+        insert(videos),
+        [
+            {
+                "job_id": job_id,
+                "key": video.key,
+                "shard_id": shard_id(job_id, plan.ordinal),
+                "position": position,
+                "uri": video.uri,
+                "size_bytes": video.size_bytes,
+                "etag": video.etag,
+                "status": VideoStatus.PENDING.value,
+            }
+            for plan in new
+            for position, video in enumerate(plan.videos)
+        ],
+    )
+    num_videos = sum(len(plan.videos) for plan in new)
+    tx.run(
+        update(jobs)
+        .where(jobs.c.id == job_id)
+        .values(
+            shards_total=jobs.c.shards_total + len(new),
+            videos_total=jobs.c.videos_total + num_videos,
+            updated_at=tx.now,
+        )
+    )
+    tx.emit(job_id, EventKind.SHARDS_PLANNED, shards=len(new), videos=num_videos)
+
+
+def finish_planning(tx: Tx, job_id: str) -> None:
+    """See `Store.finish_planning`. Nothing changes for a job that is not being planned any more."""
+    job = lock_job(tx, job_id)
+    if JobState(job.state) is not JobState.RUNNING or job.planned:
+        return
+    tx.run(update(jobs).where(jobs.c.id == job_id).values(planned=True, updated_at=tx.now))
+    tx.emit(job_id, EventKind.PLANNING_FINISHED, shards=job.shards_total, videos=job.videos_total)
+
+
+def fail_job(tx: Tx, job_id: str, code: str, message: str) -> None:
+    """See `Store.fail_job`. Leased shards are stopped through their renewals. A job that has ended stays as it is."""
+    job = lock_job(tx, job_id)
+    if JobState.FAILED not in JOB_TRANSITIONS[JobState(job.state)]:
+        return
+    error = {"error_code": code, "error_message": message}
+    move_job(tx, job, JobState.FAILED, event_data=error, **error)
+    _cancel_pending(tx, job_id)
+
+
+def begin_finalizing(tx: Tx, job_id: str) -> bool:
+    """Running -> finalizing if every shard is settled; True if the job is finalizing now."""
+    job = lock_job(tx, job_id)
+    if JobState(job.state) is JobState.FINALIZING:
+        return True
+    if JobState(job.state) is not JobState.RUNNING or not job.planned or job.shards_committed != job.shards_total:
+        return False
+    move_job(tx, job, JobState.FINALIZING)
+    return True
+
+
+def finish_job(tx: Tx, job_id: str) -> None:
+    """See `Store.finish_job`. Idempotent."""
+    job = lock_job(tx, job_id)
+    if JobState(job.state) in (JobState.SUCCEEDED, JobState.SUCCEEDED_WITH_ERRORS):
+        return
+    with_errors = job.videos_failed + job.videos_quarantined > 0
+    counts = {
+        "videos_succeeded": job.videos_succeeded,
+        "videos_failed": job.videos_failed,
+        "videos_quarantined": job.videos_quarantined,
+    }
+    move_job(tx, job, JobState.SUCCEEDED_WITH_ERRORS if with_errors else JobState.SUCCEEDED, event_data=counts)
+
+
+def _cancel_pending(tx: Tx, job_id: str) -> None:
+    tx.run(
+        update(shards)
+        .where(shards.c.job_id == job_id, shards.c.state == ShardState.PENDING)
+        .values(state=ShardState.CANCELLED.value)
+    )

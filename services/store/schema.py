@@ -1,0 +1,193 @@
+"""The tables. `migrations/` creates them; a test holds the two together."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime
+from enum import StrEnum
+
+from sqlalchemy import (
+    JSON,
+    BigInteger,
+    Boolean,
+    CheckConstraint,
+    Column,
+    DateTime,
+    Dialect,
+    ForeignKey,
+    Index,
+    Integer,
+    MetaData,
+    String,
+    Table,
+    Text,
+    TypeDecorator,
+    UniqueConstraint,
+    text,
+)
+from sqlalchemy.dialects.postgresql import JSONB
+
+from services.domain.states import JobState, ShardState, VideoStatus
+
+
+class UtcDateTime(TypeDecorator[datetime]):
+    """Aware UTC times: `timestamptz` in PostgreSQL, text of fixed width (so that it sorts) in SQLite."""
+
+    impl = DateTime(timezone=True)
+    cache_ok = True
+
+    def process_bind_param(self, value: datetime | None, dialect: Dialect) -> datetime | None:
+        if value is None:
+            return None
+        utc = value.astimezone(UTC)
+        return utc.replace(tzinfo=None) if dialect.name == "sqlite" else utc
+
+    def process_result_value(self, value: datetime | None, dialect: Dialect) -> datetime | None:
+        if value is None:
+            return None
+        return value.replace(tzinfo=UTC) if value.tzinfo is None else value.astimezone(UTC)
+
+
+Json = JSON().with_variant(JSONB(), "postgresql")
+
+# SQLite numbers rows by itself only in a column declared INTEGER.
+Sequence = BigInteger().with_variant(Integer(), "sqlite")
+
+metadata = MetaData(
+    naming_convention={
+        "ix": "ix_%(table_name)s_%(column_0_N_name)s",
+        "uq": "uq_%(table_name)s_%(column_0_N_name)s",
+        "ck": "ck_%(table_name)s_%(constraint_name)s",
+        "fk": "fk_%(table_name)s_%(column_0_name)s_%(referred_table_name)s",
+        "pk": "pk_%(table_name)s",
+    }
+)
+
+
+def _one_of(column: str, values: type[StrEnum]) -> CheckConstraint:
+    names = ", ".join(f"'{value}'" for value in values)
+    return CheckConstraint(f"{column} IN ({names})", name=column)
+
+
+def _count(name: str) -> Column[int]:
+    return Column(name, BigInteger, nullable=False, server_default=text("0"))
+
+
+jobs = Table(
+    "jobs",
+    metadata,
+    Column("id", String(40), primary_key=True),
+    Column("tenant", String(64), nullable=False),
+    Column("spec", Json, nullable=False),
+    Column("output", Text, nullable=False),
+    Column("state", String(32), nullable=False),
+    Column("planned", Boolean, nullable=False, server_default=text("false")),
+    Column("error_code", String(64)),
+    Column("error_message", Text),
+    Column("created_at", UtcDateTime, nullable=False),
+    Column("updated_at", UtcDateTime, nullable=False),
+    Column("started_at", UtcDateTime),
+    Column("finished_at", UtcDateTime),
+    # Counters, kept by the transactions that change what they count.
+    _count("shards_total"),
+    _count("shards_committed"),
+    _count("videos_total"),
+    _count("videos_succeeded"),
+    _count("videos_failed"),
+    _count("videos_quarantined"),
+    _count("frames_committed"),
+    _one_of("state", JobState),
+    Index("ix_jobs_state_id", "state", "id"),
+    # An output belongs to one job that is alive or has succeeded.
+    Index(
+        "uq_jobs_output_owner",
+        "output",
+        unique=True,
+        sqlite_where=text("state NOT IN ('failed', 'cancelled')"),
+        postgresql_where=text("state NOT IN ('failed', 'cancelled')"),
+    ),
+)
+
+idempotency_keys = Table(
+    "idempotency_keys",
+    metadata,
+    Column("tenant", String(64), primary_key=True),
+    Column("key", String(255), primary_key=True),
+    Column("spec_hash", String(64), nullable=False),
+    Column("job_id", ForeignKey("jobs.id", ondelete="CASCADE"), nullable=False),
+    Column("created_at", UtcDateTime, nullable=False),
+)
+
+shards = Table(
+    "shards",
+    metadata,
+    Column("id", String(64), primary_key=True),
+    Column("job_id", ForeignKey("jobs.id", ondelete="CASCADE"), nullable=False),
+    Column("ordinal", Integer, nullable=False),
+    Column("state", String(16), nullable=False),
+    Column("plan_hash", String(64), nullable=False),
+    Column("num_videos", Integer, nullable=False),
+    Column("input_bytes", BigInteger, nullable=False),
+    # The lease, and what its holder reported last.
+    Column("attempts", Integer, nullable=False, server_default=text("0")),
+    Column("fence", BigInteger, nullable=False, server_default=text("0")),
+    Column("holder", String(255)),
+    Column("leased_at", UtcDateTime),
+    Column("renewed_at", UtcDateTime),
+    Column("lease_expires_at", UtcDateTime),
+    Column("video_key", String(128)),
+    Column("stage", String(64)),
+    _count("videos_done"),
+    _count("frames_done"),
+    Column("frames_expected", BigInteger),
+    # The commit.
+    Column("tar_name", String(255)),
+    Column("committed_at", UtcDateTime),
+    _one_of("state", ShardState),
+    UniqueConstraint("job_id", "ordinal"),
+    Index("ix_shards_job_id_state_committed_at", "job_id", "state", "committed_at"),
+    Index(
+        "ix_shards_claimable",
+        "job_id",
+        "ordinal",
+        sqlite_where=text("state = 'pending'"),
+        postgresql_where=text("state = 'pending'"),
+    ),
+    Index(
+        "ix_shards_expiring",
+        "lease_expires_at",
+        sqlite_where=text("state = 'leased'"),
+        postgresql_where=text("state = 'leased'"),
+    ),
+)
+
+videos = Table(
+    "videos",
+    metadata,
+    Column("job_id", ForeignKey("jobs.id", ondelete="CASCADE"), primary_key=True),
+    Column("key", String(128), primary_key=True),
+    Column("shard_id", ForeignKey("shards.id", ondelete="CASCADE"), nullable=False),
+    Column("position", Integer, nullable=False),
+    Column("uri", Text, nullable=False),
+    Column("size_bytes", BigInteger, nullable=False),
+    Column("etag", Text),
+    Column("status", String(16), nullable=False),
+    Column("deaths", Integer, nullable=False, server_default=text("0")),
+    Column("error_code", String(64)),
+    Column("result", Json),
+    _one_of("status", VideoStatus),
+    UniqueConstraint("shard_id", "position"),
+    Index("ix_videos_job_id_status_key", "job_id", "status", "key"),
+    Index("ix_videos_job_id_error_code_key", "job_id", "error_code", "key"),
+)
+
+events = Table(
+    "events",
+    metadata,
+    Column("seq", Sequence, primary_key=True, autoincrement=True),
+    Column("job_id", ForeignKey("jobs.id", ondelete="CASCADE"), nullable=False),
+    Column("at", UtcDateTime, nullable=False),
+    Column("kind", String(64), nullable=False),
+    Column("data", Json, nullable=False),
+    Index("ix_events_job_id_seq", "job_id", "seq"),
+    sqlite_autoincrement=True,
+)

@@ -1,0 +1,148 @@
+"""The store on SQLAlchemy: each method is one transaction of `jobs`, `leases` or `reading`."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from functools import partial
+
+from sqlalchemy import select
+
+from services.domain.models import (
+    CommitRecord,
+    Event,
+    Job,
+    JobSpec,
+    Lease,
+    LeaseProgress,
+    Renewal,
+    Shard,
+    ShardPlan,
+)
+from services.domain.states import JobState, VideoStatus
+from services.store import jobs, leases, migrations, reading
+from services.store.base import VideoRow
+from services.store.database import Database
+
+
+class SqlStore:
+    """`Store` on SQLite or PostgreSQL.
+
+    Args:
+        url: `sqlite:////absolute/path/vipe.db` or `postgresql://user@host/name`.
+        migrate: Bring the schema to the newest revision first.
+
+    Raises:
+        StoreUnavailable: By every method, when the database does not answer.
+    """
+
+    def __init__(self, url: str, *, migrate: bool = True) -> None:
+        self._db = Database(url)
+        if migrate:
+            self.upgrade()
+
+    def upgrade(self) -> None:
+        """Bring the schema to the newest revision."""
+        migrations.upgrade(self._db)
+
+    # Jobs -----------------------------------------------------------------------------------------------------------
+    def create_job(
+        self, spec: JobSpec, *, tenant: str = "default", idempotency_key: str | None = None
+    ) -> tuple[Job, bool]:
+        job_id, created = self._db.write(lambda tx: jobs.create_job(tx, spec, tenant, idempotency_key))
+        return self.get_job(job_id), created
+
+    def get_job(self, job_id: str) -> Job:
+        return self._db.read(lambda tx: reading.get_job(tx, job_id))
+
+    def list_jobs(
+        self, *, limit: int = 50, after: str | None = None, state: JobState | None = None
+    ) -> tuple[list[Job], str | None]:
+        return self._db.read(lambda tx: reading.list_jobs(tx, limit, after, state))
+
+    def request_cancel(self, job_id: str) -> Job:
+        self._db.write(lambda tx: jobs.request_cancel(tx, job_id))
+        return self.get_job(job_id)
+
+    # Planning -------------------------------------------------------------------------------------------------------
+    def next_unplanned(self) -> Job | None:
+        return self._db.read(lambda tx: reading.first_job(tx, reading.unplanned()))
+
+    def begin_planning(self, job_id: str) -> bool:
+        return self._db.write(lambda tx: jobs.begin_planning(tx, job_id))
+
+    def add_shards(self, job_id: str, shards: Iterable[ShardPlan]) -> None:
+        plans = list(shards)
+        self._db.write(lambda tx: jobs.add_shards(tx, job_id, plans))
+
+    def finish_planning(self, job_id: str) -> None:
+        self._db.write(lambda tx: jobs.finish_planning(tx, job_id))
+
+    def fail_job(self, job_id: str, code: str, message: str) -> None:
+        self._db.write(lambda tx: jobs.fail_job(tx, job_id, code, message))
+
+    # Leases ---------------------------------------------------------------------------------------------------------
+    def claim(self, holder: str, *, limit: int, ttl_s: float) -> list[Lease]:
+        return self._db.write(lambda tx: leases.claim(tx, holder, limit, ttl_s))
+
+    def renew(self, holder: str, progress: Sequence[LeaseProgress], *, ttl_s: float) -> list[Renewal]:
+        return self._db.write(lambda tx: leases.renew(tx, holder, progress, ttl_s)) if progress else []
+
+    def holds(self, shard_id: str, fence: int) -> bool:
+        return self._db.read(lambda tx: leases.holds(tx, shard_id, fence))
+
+    def blame(self, shard_id: str, fence: int, video_key: str, reason: str) -> int:
+        return self._db.write(lambda tx: leases.blame(tx, shard_id, fence, video_key, reason))
+
+    def release(self, shard_id: str, fence: int, reason: str) -> None:
+        self._db.write(lambda tx: leases.release(tx, shard_id, fence, reason))
+
+    def record_commit(self, record: CommitRecord) -> bool:
+        return self._db.write(lambda tx: leases.record_commit(tx, record))
+
+    def expire_leases(self) -> int:
+        jobs_to_look_at = self._db.read(leases.expirable_jobs)
+        return sum(self._db.write(partial(leases.expire_job, job_id=job_id)) for job_id in jobs_to_look_at)
+
+    # Finalising -----------------------------------------------------------------------------------------------------
+    def next_finalizable(self) -> Job | None:
+        while True:
+            job = self._db.read(lambda tx: reading.first_job(tx, reading.finalizable()))
+            if job is None or job.state is JobState.FINALIZING:
+                return job
+            # Somebody else may have cancelled or failed it meanwhile: then look again.
+            if self._db.write(partial(jobs.begin_finalizing, job_id=job.id)):
+                return self.get_job(job.id)
+
+    def finish_job(self, job_id: str) -> Job:
+        self._db.write(lambda tx: jobs.finish_job(tx, job_id))
+        return self.get_job(job_id)
+
+    # Reading --------------------------------------------------------------------------------------------------------
+    def list_videos(
+        self,
+        job_id: str,
+        *,
+        status: VideoStatus | None = None,
+        error_code: str | None = None,
+        limit: int = 100,
+        after: str | None = None,
+    ) -> tuple[list[VideoRow], str | None]:
+        return self._db.read(lambda tx: reading.list_videos(tx, job_id, status, error_code, limit, after))
+
+    def list_shards(self, job_id: str, *, limit: int = 100, after: str | None = None) -> tuple[list[Shard], str | None]:
+        return self._db.read(lambda tx: reading.list_shards(tx, job_id, limit, after))
+
+    def uncommitted_shards(self, job_id: str) -> list[Shard]:
+        return self._db.read(lambda tx: reading.uncommitted_shards(tx, job_id))
+
+    def events(self, job_id: str, *, after_seq: int = 0, limit: int = 1000) -> list[Event]:
+        return self._db.read(lambda tx: reading.list_events(tx, job_id, after_seq, limit))
+
+    def counts(self) -> dict[str, dict[str, int]]:
+        return self._db.read(reading.counts)
+
+    def ping(self) -> None:
+        self._db.read(lambda tx: tx.first(select(1)))
+
+    def close(self) -> None:
+        self._db.close()

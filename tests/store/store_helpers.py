@@ -1,0 +1,62 @@
+"""Short ways to build the store's values in tests."""
+
+from __future__ import annotations
+
+from services.domain.models import CommitRecord, JobSpec, Lease, ShardPlan, VideoRef, VideoResult
+from services.domain.states import VideoStatus
+from services.store.base import Store
+
+
+def spec(output: str = "/out", **changes: object) -> JobSpec:
+    return JobSpec(**{"inputs": ("/in",), "output": output, **changes})  # type: ignore[arg-type]
+
+
+def plans(number: int, videos_each: int = 2) -> list[ShardPlan]:
+    return [
+        ShardPlan(i, tuple(VideoRef(f"s{i}v{k}", f"/in/s{i}v{k}.mp4", 10, f"tag{k}") for k in range(videos_each)))
+        for i in range(number)
+    ]
+
+
+def planned_job(store: Store, number: int = 3, videos_each: int = 2, output: str = "/out") -> str:
+    job, _ = store.create_job(spec(output))
+    assert store.begin_planning(job.id)
+    store.add_shards(job.id, plans(number, videos_each))
+    store.finish_planning(job.id)
+    return job.id
+
+
+def record(
+    lease: Lease,
+    status: VideoStatus = VideoStatus.SUCCEEDED,
+    frames: int = 10,
+    fence: int | None = None,
+    plan_hash: str | None = None,
+) -> CommitRecord:
+    failed = status is not VideoStatus.SUCCEEDED
+    return CommitRecord(
+        job_id=lease.job_id,
+        shard_id=lease.shard_id,
+        ordinal=lease.ordinal,
+        plan_hash=lease.plan_hash if plan_hash is None else plan_hash,
+        config_hash=lease.spec.config_hash,
+        attempt=lease.attempt,
+        fence=lease.fence if fence is None else fence,
+        holder=lease.holder,
+        tar_name=None if failed else f"tar-{lease.ordinal}",
+        objects=(),
+        videos=tuple(
+            VideoResult(
+                v.key,
+                v.uri,
+                status,
+                lease.attempt,
+                error_code="media_corrupt" if failed else None,
+                error_message="broken" if failed else None,
+                num_frames=None if failed else frames,
+                camera_params=None if failed else (1.0, 2.0, 3.0, 4.0),
+                quality=None if failed else {"score": 0.5, "bad": float("nan")},
+            )
+            for v in lease.videos
+        ),
+    )
