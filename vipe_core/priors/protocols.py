@@ -98,3 +98,18 @@ class IntrinsicsEstimate:
 class IntrinsicsInit(Protocol):
     def estimate(self, frames: Sequence[WorkingFrame], grid: Grid) -> IntrinsicsEstimate:
         """Estimate the camera from frames spread over the clip (in time order, consecutive runs allowed)."""
+
+
+@dataclass(frozen=True, slots=True)
+class PriorFamily:
+    """The providers of the geometric roles, made to work together (the tracker reads the matcher's features).
+
+    Attributes:
+        matcher: Dense matching.
+        tracker: Sparse tracks, or None for a family whose dense matching needs none.
+        intrinsics: Initial camera.
+    """
+
+    matcher: DenseMatcher
+    tracker: SparseTracker | None
+    intrinsics: IntrinsicsInit

@@ -1,0 +1,20 @@
+"""The embedded family: no weights, CPU only, deterministic for a given number of OpenCV threads."""
+
+from __future__ import annotations
+
+from vipe_core.priors.classical.features import FlowFeatures
+from vipe_core.priors.classical.flow import DisFlowMatcher
+from vipe_core.priors.classical.focal import FocalVote, TwoViewFocalInit
+from vipe_core.priors.classical.tracks import LkTracker
+from vipe_core.priors.protocols import PriorFamily
+
+__all__ = ["DisFlowMatcher", "FlowFeatures", "FocalVote", "LkTracker", "TwoViewFocalInit", "classical_priors"]
+
+
+def classical_priors() -> PriorFamily:
+    """DIS flow, Lucas-Kanade tracks and the two-view focal vote.
+
+    Make one per thread. The number of OpenCV threads is the caller's choice.
+    """
+    matcher = DisFlowMatcher()
+    return PriorFamily(matcher=matcher, tracker=LkTracker(), intrinsics=TwoViewFocalInit(matcher))

@@ -1,0 +1,146 @@
+"""What the classical matchers keep of a frame, and the small dense-field operations that they share."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from vipe_core.ba.problem import Grid
+
+Array = NDArray[Any]
+
+STRIDE = 8
+"""Working pixels per grid cell. Cell (y, x) samples index coordinates (8x + 3.5, 8y + 3.5)."""
+
+_STRUCTURE_BOX_PX = 13
+_MASK_MARGIN_PX = 4
+
+
+@dataclass(frozen=True)
+class FlowFeatures:
+    """A working frame, ready to be matched. Derived arrays are computed when first asked for and then kept.
+
+    Attributes:
+        index: Frame index in the video.
+        gray: (h, w) uint8.
+        valid: (h, w) bool, False on pixels that must not be used, or None.
+        grid: Cells of the frame.
+    """
+
+    index: int
+    gray: NDArray[np.uint8]
+    valid: NDArray[np.bool_] | None
+    grid: Grid
+
+    @cached_property
+    def half(self) -> NDArray[np.uint8]:
+        """(h/2, w/2) uint8, area-averaged."""
+        height, width = self.gray.shape
+        return np.asarray(cv2.resize(self.gray, (width // 2, height // 2), interpolation=cv2.INTER_AREA))
+
+    @cached_property
+    def structure(self) -> NDArray[np.float32]:
+        """(P, 2) squared gradient per component, (grey levels / px)^2, averaged over a box of about 12 px per cell."""
+        gx = cv2.Scharr(self.gray, cv2.CV_32F, 1, 0, scale=1 / 32)
+        gy = cv2.Scharr(self.gray, cv2.CV_32F, 0, 1, scale=1 / 32)
+        box = (_STRUCTURE_BOX_PX, _STRUCTURE_BOX_PX)
+        return np.stack([cell_mean(cv2.blur(g * g, box)).reshape(-1) for g in (gx, gy)], axis=-1)
+
+    @cached_property
+    def usable(self) -> NDArray[np.bool_] | None:
+        """(h, w) bool: `valid` shrunk by a few pixels, because flow bleeds over the border of a mask."""
+        if self.valid is None or bool(self.valid.all()):
+            return None
+        kernel = np.ones((2 * _MASK_MARGIN_PX + 1,) * 2, np.uint8)
+        return np.asarray(cv2.erode(self.valid.astype(np.uint8), kernel)).astype(bool)
+
+    @cached_property
+    def usable_cells(self) -> NDArray[np.bool_]:
+        """(P,) bool: cells whose sample point may be used."""
+        if self.usable is None:
+            return np.ones(self.grid.num_cells, bool)
+        return np.asarray(cell_mean(self.usable.astype(np.float32)).reshape(-1) > 0.99)
+
+    @cached_property
+    def textured_cells(self) -> NDArray[np.bool_]:
+        """(P,) bool: usable cells with texture.
+
+        The bar is the smaller of a fixed level and a quantile of the frame itself, so that a frame of blank walls
+        still votes with its best cells.
+        """
+        strength = self.structure.max(axis=1)
+        usable = self.usable_cells
+        if not usable.any():
+            return usable
+        return np.asarray(usable & (strength >= min(4.0, float(np.quantile(strength[usable], 0.7)))))
+
+    @cached_property
+    def structure_floor(self) -> float:
+        """The structure at which a cell has half of the full weight; lower in frames with little texture."""
+        usable = self.usable_cells
+        if not usable.any():
+            return 9.0
+        return float(np.clip(np.quantile(self.structure.max(axis=1)[usable], 0.6), 1.0, 9.0))
+
+
+def grid_of(gray: Array) -> Grid:
+    """The grid of a working image: one cell per full 8 x 8 block."""
+    height, width = gray.shape
+    return Grid(height // STRIDE, width // STRIDE, float(STRIDE), (STRIDE - 1) / 2)
+
+
+def cell_mean(field: Array) -> NDArray[np.float32]:
+    """Samples (h, w[, c]) at the cell centres: mean of the four central pixels, never of the whole cell."""
+    lo = STRIDE // 2 - 1
+    rows, cols = field.shape[0] // STRIDE * STRIDE, field.shape[1] // STRIDE * STRIDE
+    f = field[:rows, :cols]
+    a, b = slice(lo, None, STRIDE), slice(lo + 1, None, STRIDE)
+    return np.asarray(0.25 * (f[a, a] + f[a, b] + f[b, a] + f[b, b]), np.float32)
+
+
+def cell_centres_px(grid: Grid) -> NDArray[np.float32]:
+    """(P, 2) index coordinates (u, v) of the cells, row-major."""
+    v, u = np.mgrid[: grid.height, : grid.width].astype(np.float32) * grid.stride + grid.offset
+    return np.stack((u.reshape(-1), v.reshape(-1)), axis=-1)
+
+
+def sample_px(field: Array, points_px: Array) -> NDArray[np.float32]:
+    """Bilinear samples of (h, w[, c]) at (N, 2) index coordinates; coordinates outside take the border's value."""
+    points = np.ascontiguousarray(points_px, np.float32)[:, None]
+    # cv2.remap keeps its coordinates in 16 bits: rows go in as blocks that stay below.
+    blocks = [
+        cv2.remap(field, points[k : k + 30000], None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        for k in range(0, len(points), 30000)
+    ]
+    out = np.concatenate(blocks)[:, 0] if blocks else np.zeros((0, *field.shape[2:]), field.dtype)
+    return np.asarray(out, np.float32)
+
+
+def dense_from_cells(cells: Array, grid: Grid, shape: tuple[int, int]) -> NDArray[np.float32]:
+    """Bilinear (h, w, c) field from (P, c) values at the cell centres; constant beyond the outermost centres."""
+    height, width = shape
+    low = np.ascontiguousarray(cells, np.float32).reshape(grid.height, grid.width, -1)
+    rows, cols = grid.height * STRIDE, grid.width * STRIDE
+    full = cv2.resize(low, (cols, rows), interpolation=cv2.INTER_LINEAR).reshape(rows, cols, -1)
+    if (rows, cols) != shape:
+        full = cv2.copyMakeBorder(full, 0, height - rows, 0, width - cols, cv2.BORDER_REPLICATE)
+    return np.ascontiguousarray(full, np.float32).reshape(height, width, -1)
+
+
+def fill_cells(values: Array, known: Array, grid: Grid) -> NDArray[np.float32]:
+    """(P, c) with unknown cells filled from known ones nearby (normalised Gaussian blur at two widths)."""
+    v = np.where(known[:, None], values, 0).astype(np.float32).reshape(grid.height, grid.width, -1)
+    k = known.astype(np.float32).reshape(grid.height, grid.width)
+    out = np.empty_like(v)
+    median = np.median(values[known], axis=0) if known.any() else np.zeros(v.shape[-1])
+    out[:] = median
+    for sigma in (6.0, 1.5):
+        weight = cv2.GaussianBlur(k, (0, 0), sigma)
+        blurred = cv2.GaussianBlur(v, (0, 0), sigma).reshape(v.shape)
+        out = np.where(weight[..., None] > 0.05, blurred / np.maximum(weight, 1e-6)[..., None], out)
+    return np.where(known[:, None], values, out.reshape(len(values), -1)).astype(np.float32)

@@ -1,0 +1,148 @@
+"""Dense matching by DIS optical flow (Kroeger et al., ECCV 2016) with forward-backward and structure weights.
+
+No weights to download, CPU only. The bundle adjustment's current estimate of the flow goes in as the starting point
+of the search, the role that the recurrent update has in the paper.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from vipe_core.ba.problem import Grid
+from vipe_core.priors.classical.features import (
+    Array,
+    FlowFeatures,
+    cell_centres_px,
+    cell_mean,
+    dense_from_cells,
+    fill_cells,
+    grid_of,
+    sample_px,
+)
+from vipe_core.priors.protocols import Match, WorkingFrame
+
+# A pixel whose forward and backward flows disagree by this much (plus 1 % of the flow) gets exp(-1) of its weight.
+_FB_TOLERANCE_PX = 0.6
+_FB_TOLERANCE_RATIO = 0.01
+_MIN_FB_WEIGHT = 0.02
+# Beyond this median displacement (share of the image diagonal) DIS's own pyramid is not trusted to follow a guess.
+_WIDE_MOTION_RATIO = 0.1
+
+
+class DisFlowMatcher:
+    """`DenseMatcher` without a network. One instance per thread: OpenCV's flow object owns its buffers."""
+
+    def __init__(self) -> None:
+        self._medium = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+        self._fast = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_FAST)
+        self._ultrafast = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST)
+        self._half = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_FAST)
+        self._half.setFinestScale(1)
+        self._half.setVariationalRefinementIterations(0)
+
+    def encode(self, frame: WorkingFrame) -> FlowFeatures:
+        """Features of a frame; needs at least 16 x 16 pixels."""
+        gray = np.ascontiguousarray(frame.gray)
+        return FlowFeatures(frame.index, gray, frame.valid, grid_of(gray))
+
+    def motion_px(self, source: FlowFeatures, target: FlowFeatures) -> float:
+        """Median displacement over textured cells, pixels (the mean would follow moving objects)."""
+        cells = source.textured_cells
+        if not cells.any():
+            return 0.0
+        flow = self._half.calc(source.half, target.half, None)
+        points = (cell_centres_px(source.grid) - 0.5) / 2
+        return 2 * float(np.median(np.linalg.norm(sample_px(flow, points[cells]), axis=1)))
+
+    def match(self, source: FlowFeatures, target: FlowFeatures, guess_px: Array | None = None) -> tuple[Match, Match]:
+        """Measurements source -> target and target -> source; see `DenseMatcher.match`."""
+        forward_init, backward_init = _initial_flows(source, guess_px)
+        forward = self._refined(self._medium, source.gray, target.gray, forward_init)
+        backward = self._refined(self._medium, target.gray, source.gray, backward_init)
+        return _measure(source, target, forward, backward), _measure(target, source, backward, forward)
+
+    def match_fast(self, source: FlowFeatures, target: FlowFeatures, guess_px: Array | None = None) -> Match:
+        """One-way measurement; the backward flow of the check is the cheapest preset."""
+        forward_init, _ = _initial_flows(source, guess_px)
+        forward = self._refined(self._fast, source.gray, target.gray, forward_init)
+        # The check runs at its own cost but must not fail for wide motion: it starts from the inverse of the answer.
+        inverse = _inverse_cells(cell_mean(forward).reshape(-1, 2), source.grid)
+        init = dense_from_cells(inverse, source.grid, source.gray.shape)
+        backward = self._ultrafast.calc(target.gray, source.gray, init)
+        return _measure(source, target, forward, backward)
+
+    def flow_px(self, source: Array, target: Array) -> NDArray[np.float32]:
+        """Dense (h, w, 2) flow between two gray images at the quality of `match`."""
+        return np.asarray(self._medium.calc(source, target, None))
+
+    def _refined(self, dis: Any, source: Array, target: Array, init: Array | None) -> NDArray[np.float32]:
+        if init is None:
+            return np.asarray(dis.calc(source, target, None))
+        height, width = source.shape
+        reach = float(np.median(np.linalg.norm(cell_mean(init), axis=-1)))
+        if reach > _WIDE_MOTION_RATIO * float(np.hypot(height, width)):
+            # Far from zero, DIS may drop the guess at its coarsest scale. Warp the target by the guess, measure the
+            # small residual, and let the flow between the original images (no resampling blur) polish the sum.
+            u, v = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
+            warped = cv2.remap(
+                target, u + init[..., 0], v + init[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+            )
+            residual = self._fast.calc(source, warped, None)
+            init = init + residual
+        return np.asarray(dis.calc(source, target, np.array(init, np.float32, order="C")))
+
+
+def _initial_flows(
+    source: FlowFeatures, guess_px: Array | None
+) -> tuple[NDArray[np.float32] | None, NDArray[np.float32] | None]:
+    """Dense starting flows in both directions from the guess at the source cells; None without a usable guess."""
+    if guess_px is None:
+        return None, None
+    height, width = source.gray.shape
+    displacement = np.asarray(guess_px, np.float64) - cell_centres_px(source.grid)
+    # Points that the current geometry puts behind the camera come in as anything at all.
+    with np.errstate(invalid="ignore"):
+        known = np.isfinite(displacement).all(axis=1) & (np.abs(displacement).max(axis=1) < width + height)
+    if not known.any():
+        return None, None
+    cells = fill_cells(np.where(known[:, None], displacement, 0), known, source.grid)
+    backward = _inverse_cells(cells, source.grid)
+    shape = (height, width)
+    return dense_from_cells(cells, source.grid, shape), dense_from_cells(backward, source.grid, shape)
+
+
+def _inverse_cells(displacement: Array, grid: Grid) -> NDArray[np.float32]:
+    """(P, 2) displacement target -> source at the target's cells, from source -> target at the source's cells."""
+    landing = np.rint((displacement + cell_centres_px(grid) - grid.offset) / grid.stride).astype(np.int64)
+    inside = ((landing >= 0) & (landing < (grid.width, grid.height))).all(axis=1)
+    index = landing[inside, 1] * grid.width + landing[inside, 0]
+    count = np.bincount(index, minlength=grid.num_cells)
+    mean = np.stack(
+        [np.bincount(index, displacement[inside, k], grid.num_cells) / np.maximum(count, 1) for k in (0, 1)], axis=-1
+    )
+    if not inside.any():
+        return np.broadcast_to(-np.median(displacement, axis=0), displacement.shape).astype(np.float32)
+    return -fill_cells(mean, count > 0, grid)
+
+
+def _measure(source: FlowFeatures, target: FlowFeatures, forward: Array, backward: Array) -> Match:
+    """Samples a flow at the source's cells and weighs it by consistency with the reverse flow and by structure."""
+    height, width = target.gray.shape
+    displacement = cell_mean(forward).reshape(-1, 2)
+    target_px = cell_centres_px(source.grid) + displacement
+    inside = ((target_px >= 0) & (target_px <= (width - 1, height - 1))).all(axis=1)
+    error = np.linalg.norm(displacement + sample_px(backward, target_px), axis=1)
+    tolerance = _FB_TOLERANCE_PX + _FB_TOLERANCE_RATIO * np.linalg.norm(displacement, axis=1)
+    agreement = np.exp(-np.square(error / tolerance))
+    agreement[agreement < _MIN_FB_WEIGHT] = 0
+    usable = inside & source.usable_cells
+    if target.usable is not None:
+        usable &= sample_px(target.usable.astype(np.float32), target_px) > 0.5
+    structure = source.structure / (source.structure + source.structure_floor)
+    weight = np.where(usable, agreement, 0)[:, None] * structure
+    consistent = float((error[usable] < tolerance[usable]).mean()) if usable.any() else 0.0
+    return Match(target_px.astype(np.float32), weight.astype(np.float32), consistent)

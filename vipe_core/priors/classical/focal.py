@@ -1,0 +1,235 @@
+"""Initial focal length from pairs of frames: shared-focal 6-point RANSAC and a robust vote.
+
+Each pair gives a focal length (minimal solver of Kukelova et al., ECCV 2008, as found in PoseLib) and a weight that
+tells how much better an essential matrix explains it than a homography: without parallax the focal length of a pair
+is not observable. The answer is the weighted median; its sigma comes from how well the pairs agree.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import poselib
+from numpy.typing import NDArray
+
+from vipe_core.ba.problem import Grid
+from vipe_core.cameras import Camera
+from vipe_core.priors.classical.features import FlowFeatures, cell_centres_px
+from vipe_core.priors.classical.flow import DisFlowMatcher
+from vipe_core.priors.protocols import IntrinsicsEstimate, WorkingFrame
+
+logger = logging.getLogger(__name__)
+
+# Where motion stops growing before it reaches the wanted amount, a pair is still taken from this share on.
+_ENOUGH_MOTION = 0.5
+_STILL_GROWING = 1.15
+# A pair of which only this share (or more) of the cells is matched consistently has its full weight.
+_FULL_CONSISTENCY = 0.5
+_MIN_TOTAL_WEIGHT = 0.05
+_MIN_LOG_SIGMA = 0.03
+_MIN_FOCAL_RATIO, _MAX_FOCAL_RATIO = 0.2, 4.0
+
+
+@dataclass(frozen=True, slots=True)
+class FocalVote:
+    """What one pair of frames says.
+
+    Attributes:
+        source, target: Positions in the sequence that `estimate` was given.
+        focal_px: Focal length at the working resolution.
+        weight: Inlier ratio x (1 - homography inlier ratio), less where little is matched, 0..1.
+        motion_px: Median displacement between the frames.
+    """
+
+    source: int
+    target: int
+    focal_px: float
+    weight: float
+    motion_px: float
+
+
+class TwoViewFocalInit:
+    """`IntrinsicsInit` without a network.
+
+    Wants the frames in time order, up to about 200, evenly spread or consecutive: it picks anchors and their partners
+    itself and looks at no pair that the motion between them does not call for.
+
+    Args:
+        matcher: Dense matcher.
+        num_anchors: Frames that look for a partner.
+        motion_ratio: Wanted median displacement to the partner, share of the image width.
+        max_points: Upper bound of correspondences per pair.
+        default_fov_deg: Horizontal field of view where nothing can be said.
+        default_log_sigma: Standard deviation of log(f) of that default.
+    """
+
+    def __init__(
+        self,
+        matcher: DisFlowMatcher | None = None,
+        num_anchors: int = 10,
+        motion_ratio: float = 30 / 640,
+        max_points: int = 1500,
+        default_fov_deg: float = 60.0,
+        default_log_sigma: float = 0.3,
+    ) -> None:
+        self._matcher = matcher or DisFlowMatcher()
+        self._num_anchors = num_anchors
+        self._motion_ratio = motion_ratio
+        self._max_points = max_points
+        self._default_fov_deg = default_fov_deg
+        self._default_log_sigma = default_log_sigma
+
+    def estimate(self, frames: Sequence[WorkingFrame], grid: Grid) -> IntrinsicsEstimate:
+        """A centred pinhole with square pixels; the default with a wide sigma when no pair shows parallax.
+
+        Args:
+            frames: In time order; at least one.
+            grid: Cells of the bundle adjustment (correspondences are taken at its sample points).
+        """
+        height, width = frames[0].gray.shape
+        votes = self.votes(frames)
+        default_focal = width / 2 / math.tan(math.radians(self._default_fov_deg) / 2)
+        focal, sigma = _combine(votes, default_focal, self._default_log_sigma)
+        used = sum(v.weight > 0 for v in votes)
+        logger.debug("focal %.1f px, sigma %.3f from %d pairs", focal, sigma, used)
+        camera = Camera("pinhole", (focal, focal, width / 2, height / 2), width, height)
+        return IntrinsicsEstimate(camera, sigma, used)
+
+    def votes(self, frames: Sequence[WorkingFrame]) -> list[FocalVote]:
+        """One vote for each anchor that found a partner and whose pair could be solved."""
+        last = len(frames) - 1
+        if last < 1:
+            return []
+        features: dict[int, FlowFeatures] = {}
+
+        def at(position: int) -> FlowFeatures:
+            if position not in features:
+                features[position] = self._matcher.encode(frames[position])
+            return features[position]
+
+        anchors = np.unique(np.rint(np.linspace(0, last, self._num_anchors)).astype(int)).tolist()
+        pairs: dict[tuple[int, int], float] = {}
+        for anchor in anchors:
+            for direction in (1, -1):
+                found = self._partner(at, anchor, direction, last)
+                if found is not None:
+                    pairs.setdefault((min(anchor, found[0]), max(anchor, found[0])), found[1])
+                    break
+        solved = [self._vote(at(a), at(b), a, b, motion) for (a, b), motion in sorted(pairs.items())]
+        return [v for v in solved if v is not None]
+
+    def _partner(
+        self, at: Callable[[int], FlowFeatures], anchor: int, direction: int, last: int
+    ) -> tuple[int, float] | None:
+        """The nearest frame in `direction` that has moved enough: doubling steps, then bisection."""
+        source = at(anchor)
+        wanted = self._motion_ratio * source.gray.shape[1]
+
+        def motion(position: int) -> float:
+            return self._matcher.motion_px(source, at(position))
+
+        end = last if direction > 0 else 0
+        low, moved_low, step = anchor, 0.0, 1
+        while True:
+            high = low + direction * step
+            high = min(high, end) if direction > 0 else max(high, end)
+            if high == low:
+                return None
+            reached = motion(high)
+            if reached >= wanted:
+                break
+            if moved_low >= _ENOUGH_MOTION * wanted and reached < _STILL_GROWING * moved_low:
+                # Motion no longer grows with time: the flow has lost the scene (or the camera turns back).
+                return low, moved_low
+            low, moved_low, step = high, reached, step * 2
+        while abs(high - low) > 1:
+            middle = (low + high) // 2
+            moved = motion(middle)
+            if moved >= wanted:
+                high, reached = middle, moved
+            else:
+                low = middle
+        return high, reached
+
+    def _vote(
+        self, source: FlowFeatures, target: FlowFeatures, source_at: int, target_at: int, motion: float
+    ) -> FocalVote | None:
+        points = self._correspondences(source, target)
+        if points is None:
+            return None
+        height, width = source.gray.shape
+        first, second, consistent = points
+        trust = min(1.0, consistent / _FULL_CONSISTENCY)
+        ransac = {
+            "max_iterations": 1000,
+            "min_iterations": 200,
+            "max_epipolar_error": 1.0,
+            "max_reproj_error": 1.0,
+            "seed": 0,
+        }
+        pp = np.array([(width - 1) / 2, (height - 1) / 2])
+        pair, report = poselib.estimate_shared_focal_relative_pose(first, second, pp, ransac, {})
+        _, flat = poselib.estimate_homography(first, second, ransac, {})
+        focal = float(pair.camera1.focal())
+        inliers, flat_inliers = float(report["inlier_ratio"]), float(flat["inlier_ratio"])
+        if not math.isfinite(focal) or not _MIN_FOCAL_RATIO * width < focal < _MAX_FOCAL_RATIO * width:
+            return None
+        return FocalVote(source_at, target_at, focal, inliers * max(0.0, 1 - flat_inliers) * trust, motion)
+
+    def _correspondences(
+        self, source: FlowFeatures, target: FlowFeatures
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64], float] | None:
+        """Consistent, corner-like cells, spread evenly over the frame; None when too few."""
+        forward, _ = self._matcher.match(source, target)
+        structure = source.structure
+        # Weight = agreement x structure; agreement of 0.3 is a forward-backward error of about 0.7 px.
+        agreement = (forward.weight * (structure + source.structure_floor) / np.maximum(structure, 1e-9)).max(axis=1)
+        corner = structure.min(axis=1)
+        usable = source.usable_cells
+        if not usable.any():
+            return None
+        bar = min(4.0, float(np.quantile(corner[usable], 0.6)))
+        kept = np.flatnonzero((agreement > 0.3) & (corner >= bar))
+        if len(kept) < 40:
+            return None
+        if len(kept) > self._max_points:
+            kept = kept[np.linspace(0, len(kept) - 1, self._max_points).astype(int)]
+        centres = cell_centres_px(source.grid)[kept]
+        return centres.astype(np.float64), forward.target_px[kept].astype(np.float64), forward.consistent
+
+
+def _combine(votes: Sequence[FocalVote], default_focal: float, default_sigma: float) -> tuple[float, float]:
+    """Weighted median of log(f), and an honest sigma, both blended with the default as two Gaussians.
+
+    Pairs that contradict each other (forward driving, moving objects) thereby fall back to the default smoothly.
+    """
+    weights = np.array([v.weight for v in votes])
+    if not len(votes) or weights.sum() < _MIN_TOTAL_WEIGHT:
+        return default_focal, default_sigma
+    log_focal, weights = _sorted(np.log([v.focal_px for v in votes]), weights)
+    median = _weighted_quantile(log_focal, weights, 0.5)
+    spread = 1.4826 * _weighted_quantile(*_sorted(np.abs(log_focal - median), weights), 0.5)
+    # Pairs share their errors (same scene, same kind of motion), so the spread is not divided by their number; with
+    # few or light pairs the spread itself is uncertain.
+    sigma = max(_MIN_LOG_SIGMA, spread) * math.sqrt(1 + 1 / float(weights.sum()))
+    information, default_information = 1 / sigma**2, 1 / default_sigma**2
+    total = information + default_information
+    mean = (information * median + default_information * math.log(default_focal)) / total
+    return math.exp(mean), 1 / math.sqrt(total)
+
+
+def _sorted(
+    values: NDArray[np.float64], weights: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    order = np.argsort(values, kind="stable")
+    return values[order], weights[order]
+
+
+def _weighted_quantile(values: NDArray[np.float64], weights: NDArray[np.float64], q: float) -> float:
+    """Of sorted values, linear between the middles of their weights."""
+    middle = np.cumsum(weights) - 0.5 * weights
+    return float(np.interp(q * weights.sum(), middle, values))
