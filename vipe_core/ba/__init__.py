@@ -1,1 +1,35 @@
 """Dense bundle adjustment: the problem, its plan, and its solvers."""
+
+from vipe_core.ba.levenberg import newton_step, solve
+from vipe_core.ba.problem import (
+    Edges,
+    Free,
+    Grid,
+    Options,
+    Priors,
+    Problem,
+    Result,
+    RobustKernel,
+    State,
+    Status,
+)
+from vipe_core.ba.reprojection import reproject, residuals
+from vipe_core.ba.torch_solver import Step
+
+__all__ = [
+    "Edges",
+    "Free",
+    "Grid",
+    "Options",
+    "Priors",
+    "Problem",
+    "Result",
+    "RobustKernel",
+    "State",
+    "Status",
+    "Step",
+    "newton_step",
+    "reproject",
+    "residuals",
+    "solve",
+]

@@ -1,0 +1,155 @@
+"""Levenberg-Marquardt over the normal equations: the entry points of bundle adjustment.
+
+The host reads one small tensor per step, to accept or reject it.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from vipe_core.ba import robust
+from vipe_core.ba.plan import build_plan
+from vipe_core.ba.problem import Options, Problem, Result, State, Status
+from vipe_core.ba.reprojection import require_supported
+from vipe_core.ba.torch_solver import Cost, Step, TorchSolver
+
+_MAX_DAMPING = 1e8
+_MIN_DAMPING = 1e-10
+_ACCEPTED_FACTOR = 0.2
+_REJECTED_FACTOR = 10.0
+
+
+def solve(problem: Problem, state: State, options: Options | None = None) -> Result:
+    """Minimise the robust cost from a state, accepting only steps that lower it.
+
+    Measurements and state may be on different devices; the work is done where `state.inverse_depth` is, in its dtype
+    (float32, or float64 throughout), with everything from 6x6 blocks on in float64.
+
+    Args:
+        problem: Graph, measurements, priors and what is free.
+        state: Where to start. It is not changed.
+        options: How to solve.
+
+    Returns:
+        The new state, on the same device, and why the solve ended. `cost` and `initial_cost` are of the measurements
+        alone; priors, and a charge for points that fall behind their target camera, take part in accepting a step.
+
+    Raises:
+        ConfigError: A camera model without derivatives here.
+        ValueError: Inverse depths that are neither float32 nor float64.
+    """
+    options = options or Options()
+    problem = _on_device(problem, state)
+    if not _finite(problem, state):
+        return Result(state, Status.NON_FINITE, 0, math.nan, math.nan, 0.0)
+    plan = build_plan(problem, state.inverse_depth.device)
+    solver = TorchSolver(problem, plan, options, state)
+    cost = solver.cost(state)
+    measured, weight = _read(cost.measurements, cost.weight)
+    if not (plan.num_columns or plan.any_depth_free) or not weight > 0:
+        return Result(state, Status.EMPTY, 0, measured, measured, weight)
+    if not math.isfinite(measured):
+        return Result(state, Status.NON_FINITE, 0, measured, measured, weight)
+    initial_cost = measured
+
+    lost_rho = _lost_rho(options, cost)
+    total = cost.total(lost_rho)
+    system = solver.linearise(state)
+    linearised_state = state
+    damping = options.initial_damping
+    status = Status.MAX_ITERATIONS
+    iterations = 0
+    while iterations < options.max_iterations:
+        iterations += 1
+        step = solver.step(system, damping)
+        new_state = solver.retract(state, step)
+        new_cost = solver.cost(new_state)
+        new_total = new_cost.total(lost_rho)
+        old, new, predicted, factorised = _read(total, new_total, step.predicted_drop, step.factorised)
+        if factorised and new < old:
+            state, cost, total = new_state, new_cost, new_total
+            damping = max(damping * _ACCEPTED_FACTOR, _MIN_DAMPING)
+            if old - new < options.relative_tolerance * old:
+                status = Status.CONVERGED
+                break
+            if iterations < options.max_iterations:
+                system, linearised_state = solver.linearise(state), state
+        else:
+            if factorised and predicted < options.relative_tolerance * old:
+                status = Status.CONVERGED
+                break
+            damping = max(damping * _REJECTED_FACTOR, _MIN_DAMPING)
+            if damping > _MAX_DAMPING:
+                status = Status.NO_PROGRESS if factorised else Status.SINGULAR
+                break
+
+    variance = math.nan
+    if plan.focal_column is not None:
+        if linearised_state is not state:
+            system = solver.linearise(state)
+        variance = float(solver.log_focal_variance(system))
+    measured, weight = _read(cost.measurements, cost.weight)
+    sigma = math.sqrt(variance) if variance > 0 else math.nan
+    return Result(state, status, iterations, initial_cost, measured, weight, sigma)
+
+
+def newton_step(problem: Problem, state: State, options: Options | None = None, damping: float = 0.0) -> Step:
+    """One damped Gauss-Newton step (iteratively reweighted), not applied. For tests and diagnosis.
+
+    Raises:
+        ConfigError: A camera model without derivatives here.
+    """
+    options = options or Options()
+    problem = _on_device(problem, state)
+    solver = TorchSolver(problem, build_plan(problem, state.inverse_depth.device), options, state)
+    return solver.step(solver.linearise(state), damping)
+
+
+def _on_device(problem: Problem, state: State) -> Problem:
+    require_supported(problem.camera_model)
+    if state.inverse_depth.dtype not in (torch.float32, torch.float64):
+        raise ValueError(f"inverse depths must be float32 or float64, got {state.inverse_depth.dtype}")
+    device = state.inverse_depth.device
+    edges, priors = problem.edges, problem.priors
+    return replace(
+        problem,
+        edges=replace(edges, target_px=edges.target_px.to(device), weight=edges.weight.to(device)),
+        priors=replace(
+            priors,
+            inverse_depth=None if priors.inverse_depth is None else priors.inverse_depth.to(device),
+            inverse_depth_weight=(
+                None if priors.inverse_depth_weight is None else priors.inverse_depth_weight.to(device)
+            ),
+        ),
+    )
+
+
+def _finite(problem: Problem, state: State) -> bool:
+    """Whether every number that takes part is finite. A measurement without weight takes no part."""
+    edges, priors = problem.edges, problem.priors
+    device = state.inverse_depth.device
+    checks = [tensor.isfinite().all() for tensor in (state.cam_from_world, state.inverse_depth, state.intrinsics)]
+    checks.append(edges.weight.isfinite().all())
+    checks.append((edges.target_px.isfinite() | (edges.weight <= 0)).all())
+    if priors.inverse_depth is not None and priors.inverse_depth_weight is not None:
+        checks.append(priors.inverse_depth_weight.isfinite().all())
+        checks.append((priors.inverse_depth.isfinite() | (priors.inverse_depth_weight <= 0)).all())
+    return bool(torch.stack([check.to(device) for check in checks]).all())
+
+
+def _lost_rho(options: Options, cost: Cost) -> Tensor:
+    """What a measurement costs whose point is not in front of its camera: as much as a gross outlier, px^2."""
+    outlier = robust.cost(
+        options.robust, options.robust_scale_px, torch.full_like(cost.weight, (10 * options.robust_scale_px) ** 2)
+    )
+    return torch.maximum(outlier, 4 * cost.measurements / cost.weight)
+
+
+def _read(*values: Tensor) -> list[float]:
+    """0-dim tensors of one device to the host, at once."""
+    numbers: list[float] = torch.stack([value.double() for value in values]).tolist()
+    return numbers

@@ -1,0 +1,460 @@
+"""The normal equations of dense bundle adjustment, reduced to poses and intrinsics, on any torch device.
+
+Problem. Minimise over poses G_i = cam_from_world, intrinsics k = (log f, alpha) and one inverse depth d per cell
+
+    sum_e sum_p  wmax rho(s),   s = r^T W r / wmax,   r = project(R_e ray(p; k) + d(p) t_e; k) - target,   W = diag(w)
+
+plus priors on d and log f. wmax is the larger of the two weights of a measurement, so that rho judges pixels and not
+confidences, and a component without weight has no say. (R_e, t_e) = T_e = G_j G_i^-1 for edge e = (i -> j).
+
+Linearisation. One step of iteratively reweighted least squares: residual and Jacobian rows are scaled by
+sqrt(w rho'(s)). Poses act on a pixel only through the left twist tau_e of T_e. With left perturbations of both poses
+
+    exp(delta_j) G_j G_i^-1 exp(-delta_i) = exp(delta_j - Ad(T_e) delta_i) T_e      =>      tau_e = delta_j - Ad delta_i
+
+so the per-pixel work sees 6 columns and not 12, and knows nothing of gauge or of what is fixed. With homogeneous
+X = R ray + d t and J_X = d project / d X the columns are
+
+    tau: [ d J_X ,  X x J_X ]        d: J_X t        k: J_X R d ray/dk + d project/dk
+
+Elimination. A depth is touched only by the edges that leave its frame. Per cell of source frame i with D edges, let
+e_m = J_tau^T J_d (6 rows of edge m), f = sum J_k^T J_d, v = -sum J_d r, C = sum J_d^2 + prior. Then everything that
+frame i says about (tau_1..tau_D, k, right-hand side) is one small matrix,
+
+    B_i = blockdiag(H_m) with intrinsics borders - X X^T,     column p of X = [e_1; ..; e_D; f; v] / sqrt(C)
+
+a batched matrix product of 6 D + n + 1 rows with itself (a SYRK), and the reduced system is sum_i L_i^T B_i L_i with
+L_i = [-Ad | 1], scattered to the columns of the free parameters; fixed ones fall into a dump column.
+
+Damping. Levenberg-Marquardt scales C by (1 + lambda), hence X X^T by 1 / (1 + lambda): both sums are kept apart and a
+rejected step costs one factorisation, not another linearisation. The reduced matrix is scaled to a unit diagonal
+(Jacobi) and gets lambda on it. Back-substitution is dz = (v - e^T tau - f^T dk) / (C (1 + lambda)), again from X.
+
+Precision. Per-pixel arrays are in the dtype of the inverse depths (float32, or float64 for tests); from B_i on it is
+float64. Nothing here reads a value back to the host.
+
+Arrays per chunk of F source frames with D edges (see `plan.py`): (F, D, rows, 2, P), the pixel components planar, so
+that every operation runs along P.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from vipe_core.ba import robust
+from vipe_core.ba.plan import Chunk, Plan
+from vipe_core.ba.problem import Options, Problem, State
+from vipe_core.ba.reprojection import min_depth_factor
+from vipe_core.cameras import projection
+from vipe_core.geometry import se3
+
+# Largest change of log f in one step: beyond, the linearisation says nothing.
+_MAX_LOG_FOCAL_STEP = 0.3
+_ALPHA_RANGE = (0.0, 1.2)
+# What is kept between passes (sorted measurements, factors of the elimination) up to this size, else made again.
+_CPU_KEEP_BYTES = 1 << 30
+_GPU_KEEP_BYTES = 1 << 34
+
+
+@dataclass(frozen=True, slots=True)
+class Cost:
+    """Sums over all measurements, 0-dim float64 tensors.
+
+    Attributes:
+        measurements: sum of wmax rho(s) where valid, px^2.
+        weight: sum of wmax where valid.
+        lost_weight: sum of wmax where the point is not in front of the target camera.
+        priors: Cost of the priors.
+    """
+
+    measurements: Tensor
+    weight: Tensor
+    lost_weight: Tensor
+    priors: Tensor
+
+    def total(self, lost_rho: Tensor) -> Tensor:
+        """What a step must lower. Lost measurements cost `lost_rho` each, else losing them all would be best."""
+        return self.measurements + self.priors + lost_rho * self.lost_weight
+
+
+@dataclass(frozen=True, slots=True)
+class Step:
+    """An update of the state.
+
+    Attributes:
+        pose: (N, 6) float64 left twists of cam_from_world (translation, rotation).
+        log_focal: 0-dim float64.
+        alpha: 0-dim float64.
+        inverse_depth: (N, P), before clamping.
+        predicted_drop: 0-dim float64, g^T step: how much the undamped quadratic model expects to gain.
+        factorised: 0-dim bool, whether the reduced system was positive definite; otherwise the step is not finite.
+    """
+
+    pose: Tensor
+    log_focal: Tensor
+    alpha: Tensor
+    inverse_depth: Tensor
+    predicted_drop: Tensor
+    factorised: Tensor
+
+
+@dataclass(frozen=True, slots=True)
+class _Measured:
+    """Measurements of a chunk: target (F, D, 2, P), root of the weight (F, D, 2, P), larger weight (F, D, P)."""
+
+    target_px: Tensor
+    root_weight: Tensor
+    max_weight: Tensor
+
+
+@dataclass(frozen=True, slots=True)
+class _View:
+    """A chunk seen from a state.
+
+    points (F, D, 3, P) homogeneous, rotation (F, D, 3, 3), translation (F, D, 3, 1), s (F, D, 1, P), norm (F, D, 1, P)
+    or None, xy (F, D, 2, P) = points / s, valid (F, D, P), weighted (F, D, 2, P) = sqrt(w) r (zero where not valid),
+    squared (F, D, P) = s of the robust kernel, px^2.
+    """
+
+    points: Tensor
+    rotation: Tensor
+    translation: Tensor
+    s: Tensor
+    norm: Tensor | None
+    xy: Tensor
+    valid: Tensor
+    weighted: Tensor
+    squared: Tensor
+    adjoint: Tensor
+
+
+@dataclass(frozen=True, slots=True)
+class _Eliminated:
+    """Factors of a chunk's elimination: x (F, 6 D + n + 1, P), root_q (F, P), adjoint (F, D, 6, 6)."""
+
+    x: Tensor
+    root_q: Tensor
+    adjoint: Tensor
+
+
+@dataclass(frozen=True, slots=True)
+class Linearisation:
+    """The normal equations at a state; `TorchSolver.step` solves them for any damping.
+
+    Attributes:
+        direct: (n + 1, n + 1) float64 J^T J of poses and intrinsics, bordered by the negative gradient.
+        eliminated: The same shape: what eliminating the undamped depths subtracts.
+    """
+
+    direct: Tensor
+    eliminated: Tensor
+    state: State
+    factors: Callable[[], Iterable[tuple[Chunk, _Eliminated]]]
+
+
+class _Optics:
+    """Everything that depends on the intrinsics only."""
+
+    def __init__(self, problem: Problem, options: Options, intrinsics: Tensor, sample_px: Tensor, dtype: torch.dtype):
+        model = problem.camera_model
+        rays = projection.unproject(model, intrinsics, sample_px)
+        self.rays = rays.mT.to(dtype).contiguous()
+        by_intrinsics = projection.unproject_jacobian(model, intrinsics, sample_px)
+        self.rays_by_intrinsics = by_intrinsics.permute(2, 1, 0).to(dtype).contiguous()
+        self.min_s = min_depth_factor(model, intrinsics, sample_px, rays, options.min_depth_ratio).to(dtype)
+        self.focal = intrinsics[:2, None].to(dtype)
+        self.centre = intrinsics[2:4, None].to(dtype)
+        self.alpha = intrinsics[4].to(dtype) if model == "mei" else None
+
+
+class TorchSolver:
+    """Cost, linearisation and step of one problem. Built once per solve; holds no state of the unknowns."""
+
+    def __init__(self, problem: Problem, plan: Plan, options: Options, state: State) -> None:
+        self.problem, self.plan, self.options = problem, plan, options
+        self.dtype, self.device = state.inverse_depth.dtype, state.inverse_depth.device
+        self._sample_px = problem.grid.sample_px(device=self.device)
+        median = state.inverse_depth.median()
+        self._depth_range = (options.min_inverse_depth * median, options.max_inverse_depth * median)
+        # (log f, alpha) of the camera functions -> those that are free.
+        columns = (plan.focal_column, plan.alpha_column)
+        self._free_intrinsics = [i for i, column in enumerate(columns) if column is not None]
+        cells = len(problem.edges.source) * problem.grid.num_cells
+        keep_bytes = _CPU_KEEP_BYTES if self.device.type == "cpu" else _GPU_KEEP_BYTES
+        self._keep = cells * 12 * self.dtype.itemsize <= keep_bytes
+        self._measured: dict[int, _Measured] = {}
+
+    # -- measurement model ---------------------------------------------------------------------------------------
+
+    def _measure(self, index: int, chunk: Chunk) -> _Measured:
+        found = self._measured.get(index)
+        if found is None:
+            edges = self.problem.edges
+            weight = edges.weight[chunk.edges].to(self.dtype) * chunk.real[..., None, None]
+            target_px = torch.where(weight > 0, edges.target_px[chunk.edges].to(self.dtype), 0)
+            root = weight.clamp_min(0).sqrt().mT.contiguous()
+            found = _Measured(target_px.mT.contiguous(), root, weight.amax(-1).clamp_min(0))
+            if self._keep:
+                self._measured[index] = found
+        return found
+
+    def _optics(self, state: State) -> _Optics:
+        return _Optics(self.problem, self.options, state.intrinsics, self._sample_px, self.dtype)
+
+    def _view(self, chunk: Chunk, measured: _Measured, state: State, optics: _Optics) -> _View:
+        source_from_world = state.cam_from_world[chunk.frames][:, None]
+        transform = se3.relative(state.cam_from_world[chunk.targets], source_from_world)
+        rotation = transform[..., :3, :3].to(self.dtype)
+        translation = transform[..., :3, 3:].to(self.dtype)
+        points = rotation @ optics.rays
+        points.addcmul_(translation, state.inverse_depth[chunk.frames][:, None, None])
+        s, norm = points[:, :, 2:], None
+        valid = s[:, :, 0] > optics.min_s
+        if optics.alpha is not None:
+            norm = (points * points).sum(2, keepdim=True).sqrt()
+            s = s + optics.alpha * norm
+            beyond = (optics.alpha > 1) & (optics.alpha * points[:, :, 2] <= -norm[:, :, 0])
+            valid = (s[:, :, 0] > optics.min_s) & ~beyond
+            norm = torch.where(valid[:, :, None], norm, 1)
+        s = torch.where(valid[:, :, None], s, 1)
+        xy = points[:, :, :2] / s
+        error = torch.addcmul(optics.centre - measured.target_px, xy, optics.focal)
+        weighted = error.mul_(measured.root_weight).mul_(valid[:, :, None])
+        squared = (weighted * weighted).sum(2).div_(measured.max_weight.clamp_min(torch.finfo(self.dtype).tiny))
+        adjoint = se3.adjoint(transform)
+        return _View(points, rotation, translation, s, norm, xy, valid, weighted, squared, adjoint)
+
+    def cost(self, state: State) -> Cost:
+        """The robust cost at a state."""
+        optics = self._optics(state)
+        options = self.options
+        total = torch.zeros(4, dtype=torch.float64, device=self.device)
+        for index, chunk in enumerate(self.plan.chunks):
+            measured = self._measure(index, chunk)
+            view = self._view(chunk, measured, state, optics)
+            rho = robust.cost(options.robust, options.robust_scale_px, view.squared)
+            kept_weight = measured.max_weight * view.valid
+            total[0] += (rho * kept_weight).sum(-1).double().sum()
+            total[1] += kept_weight.sum(-1).double().sum()
+            total[2] += measured.max_weight.sum(-1).double().sum()
+            prior = self._depth_prior(chunk, state)
+            if chunk.depth_free and prior is not None:
+                total[3] += (prior[0] * prior[1] * prior[1]).sum(-1).double().sum()
+        priors = self.problem.priors
+        if priors.log_focal is not None and self.plan.focal_column is not None:
+            total[3] += ((state.intrinsics[0].log() - priors.log_focal) / priors.log_focal_sigma) ** 2
+        return Cost(total[0], total[1], total[2] - total[1], total[3])
+
+    def _depth_prior(self, chunk: Chunk, state: State) -> tuple[Tensor, Tensor] | None:
+        """Information (F, P) and prior minus state (F, P)."""
+        priors = self.problem.priors
+        if priors.inverse_depth is None or priors.inverse_depth_weight is None:
+            return None
+        weight = priors.inverse_depth_weight[chunk.frames].to(self.dtype)
+        value = torch.where(weight > 0, priors.inverse_depth[chunk.frames].to(self.dtype), 0)
+        return weight, value - state.inverse_depth[chunk.frames]
+
+    # -- normal equations ----------------------------------------------------------------------------------------
+
+    def _rows(
+        self, chunk: Chunk, view: _View, measured: _Measured, state: State, optics: _Optics
+    ) -> tuple[Tensor, Tensor]:
+        """Scaled Jacobian rows of tau and intrinsics, then the negative residual; and the row of the depth.
+
+        Returns:
+            (F, D, 6 + n + 1, 2, P) and (F, D, 2, P).
+        """
+        scale = measured.root_weight * view.valid[:, :, None]
+        residual = view.weighted
+        slope = robust.root_slope(self.options.robust, self.options.robust_scale_px, view.squared)
+        if slope is not None:
+            scale = scale * slope[:, :, None]
+            residual = residual * slope[:, :, None]
+        # J_X = scale f / s (1 - xy slope^T), slope = e_z + alpha X / |X|.
+        diagonal = scale * optics.focal / view.s
+        outer = -diagonal * view.xy
+        frames, degree, _, cells = view.points.shape
+        by_point = torch.zeros(frames, degree, 3, 2, cells, dtype=self.dtype, device=self.device)
+        by_point[:, :, 2] = outer
+        if optics.alpha is not None and view.norm is not None:
+            bend = optics.alpha * view.points / view.norm
+            by_point.addcmul_(bend[:, :, :, None], outer[:, :, None])
+        by_point[:, :, 0, 0] += diagonal[:, :, 0]
+        by_point[:, :, 1, 1] += diagonal[:, :, 1]
+
+        num_rows = 7 + len(self._free_intrinsics)
+        rows = torch.empty(frames, degree, num_rows, 2, cells, dtype=self.dtype, device=self.device)
+        torch.mul(by_point, state.inverse_depth[chunk.frames][:, None, None, None], out=rows[:, :, :3])
+        for k in range(3):
+            a, b = (k + 1) % 3, (k + 2) % 3
+            row = rows[:, :, 3 + k]
+            torch.mul(by_point[:, :, b], view.points[:, :, a, None], out=row)
+            row.addcmul_(by_point[:, :, a], view.points[:, :, b, None], value=-1)
+        for row_index, intrinsic in enumerate(self._free_intrinsics):
+            ray = view.rotation @ optics.rays_by_intrinsics[intrinsic]
+            row = rows[:, :, 6 + row_index]
+            torch.sum(by_point * ray[:, :, :, None], dim=2, out=row)
+            # Both camera derivatives are multiples of xy f: s outer = -scale f xy.
+            row.addcmul_(outer, view.s if intrinsic == 0 or view.norm is None else -view.norm, value=-1)
+        torch.neg(residual, out=rows[:, :, -1])
+        by_depth = (view.translation.mT @ by_point.flatten(3)).view(frames, degree, 2, cells)
+        return rows, by_depth
+
+    def _eliminate(self, chunk: Chunk, view: _View, rows: Tensor, by_depth: Tensor, state: State) -> _Eliminated:
+        frames, degree, num_rows, _, cells = rows.shape
+        tail = num_rows - 6
+        x = torch.empty(frames, 6 * degree + tail, cells, dtype=self.dtype, device=self.device)
+        first, second = by_depth[:, :, None, 0], by_depth[:, :, None, 1]
+        twist = x[:, : 6 * degree].view(frames, degree, 6, cells)
+        torch.mul(rows[:, :, :6, 0], first, out=twist)
+        twist.addcmul_(rows[:, :, :6, 1], second)
+        shared = rows[:, :, 6:, 0] * first
+        shared.addcmul_(rows[:, :, 6:, 1], second)
+        torch.sum(shared, dim=1, out=x[:, 6 * degree :])
+        curvature = (by_depth * by_depth).sum(dim=(1, 2))
+        prior = self._depth_prior(chunk, state)
+        if prior is not None:
+            curvature += prior[0]
+            x[:, -1].addcmul_(prior[0], prior[1])
+        seen = curvature > torch.finfo(self.dtype).tiny
+        root_q = torch.where(seen, curvature, 1).rsqrt().mul_(seen)
+        x.mul_(root_q[:, None])
+        return _Eliminated(x, root_q, view.adjoint)
+
+    def linearise(self, state: State) -> Linearisation:
+        """The normal equations at a state."""
+        optics = self._optics(state)
+        size = self.plan.num_columns + 2
+        direct = torch.zeros(size, size, dtype=torch.float64, device=self.device)
+        eliminated = torch.zeros_like(direct)
+        kept: list[tuple[Chunk, _Eliminated]] = []
+
+        def rows_of(index: int, chunk: Chunk) -> tuple[_View, Tensor, Tensor]:
+            measured = self._measure(index, chunk)
+            view = self._view(chunk, measured, state, optics)
+            return view, *self._rows(chunk, view, measured, state, optics)
+
+        for index, chunk in enumerate(self.plan.chunks):
+            view, rows, by_depth = rows_of(index, chunk)
+            flat = rows.flatten(3)
+            _scatter(direct, chunk, _border(flat @ flat.mT), view.adjoint)
+            if chunk.depth_free:
+                factor = self._eliminate(chunk, view, rows, by_depth, state)
+                _scatter(eliminated, chunk, (factor.x @ factor.x.mT).double(), view.adjoint)
+                if self._keep:
+                    kept.append((chunk, factor))
+
+        def factors() -> Iterable[tuple[Chunk, _Eliminated]]:
+            if self._keep:
+                yield from kept
+                return
+            for index, chunk in enumerate(self.plan.chunks):
+                if chunk.depth_free:
+                    yield chunk, self._eliminate(chunk, *rows_of(index, chunk), state)
+
+        priors, column = self.problem.priors, self.plan.focal_column
+        if priors.log_focal is not None and column is not None:
+            information = 1 / priors.log_focal_sigma**2
+            pull = information * (priors.log_focal - state.intrinsics[0].log())
+            direct[column, column] += information
+            direct[column, -2] += pull
+            direct[-2, column] += pull
+        return Linearisation(direct[:-1, :-1], eliminated[:-1, :-1], state, factors)
+
+    # -- solution ------------------------------------------------------------------------------------------------
+
+    def _factorise(self, system: Linearisation, damping: float) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Scale (n,), lower Cholesky factor, right-hand side (n,) and success of the damped reduced system."""
+        reduced = system.direct - system.eliminated / (1 + damping)
+        matrix, gradient = reduced[:-1, :-1], reduced[:-1, -1]
+        diagonal = matrix.diagonal()
+        # A column without any curvature has no gradient either: scaled to a unit row, it does not move.
+        known = diagonal > 1e-12 * system.direct[:-1, :-1].diagonal()
+        scale = torch.where(known, diagonal, 1).rsqrt() * known
+        scaled = matrix * scale[:, None] * scale
+        scaled.diagonal().add_(damping + (~known).double())
+        factor, info = torch.linalg.cholesky_ex(scaled)
+        return scale, factor, gradient, info == 0
+
+    def step(self, system: Linearisation, damping: float) -> Step:
+        """Solve the damped system: reduced system first, then every inverse depth."""
+        scale, factor, gradient, factorised = self._factorise(system, damping)
+        solution = torch.cholesky_solve((gradient * scale)[:, None], factor)[:, 0] * scale
+        solution = torch.where(factorised, solution, torch.nan)
+        zero = solution.new_zeros(1)
+        log_focal, alpha = zero[0], zero[0]
+        intrinsics = []
+        if (column := self.plan.focal_column) is not None:
+            log_focal = solution[column].clamp(-_MAX_LOG_FOCAL_STEP, _MAX_LOG_FOCAL_STEP)
+            solution[column] = log_focal
+            intrinsics.append(log_focal)
+        if (column := self.plan.alpha_column) is not None:
+            current = system.state.intrinsics[4]
+            alpha = (current + solution[column]).clamp(*_ALPHA_RANGE) - current
+            solution[column] = alpha
+            intrinsics.append(alpha)
+        pose = torch.cat((solution, zero, zero))[self.plan.pose_columns]
+        predicted_drop = system.direct[:-1, -1] @ solution
+
+        depth = torch.zeros_like(system.state.inverse_depth)
+        shared = torch.stack([-value for value in intrinsics] + [torch.ones_like(zero[0])])
+        for chunk, factors in system.factors():
+            source = pose[chunk.frames][:, None, :, None]
+            twist = (factors.adjoint @ source)[..., 0] - pose[chunk.targets]
+            combination = torch.cat((twist.flatten(1), shared.expand(len(twist), -1)), dim=1).to(self.dtype)
+            scaled_step = (combination[:, None] @ factors.x)[:, 0].div_(1 + damping)
+            predicted_drop = predicted_drop + (scaled_step * factors.x[:, -1]).sum(-1).double().sum()
+            depth[chunk.frames] = scaled_step * factors.root_q
+        return Step(pose, log_focal, alpha, depth, predicted_drop, factorised)
+
+    def retract(self, state: State, step: Step) -> State:
+        """The state after a step. Whatever the step does not touch keeps its bits."""
+        intrinsics = state.intrinsics.clone()
+        intrinsics[:2] *= step.log_focal.exp()
+        if self.plan.alpha_column is not None:
+            intrinsics[4] += step.alpha
+        inverse_depth = state.inverse_depth.clone()
+        for chunk in self.plan.chunks:
+            if chunk.depth_free:
+                moved = state.inverse_depth[chunk.frames] + step.inverse_depth[chunk.frames]
+                inverse_depth[chunk.frames] = moved.clamp(*self._depth_range)
+        return State(se3.exp(step.pose) @ state.cam_from_world, inverse_depth, intrinsics)
+
+    def log_focal_variance(self, system: Linearisation) -> Tensor:
+        """Variance of log f with everything else marginalised; NaN where the system is singular. 0-dim."""
+        column = self.plan.focal_column
+        assert column is not None
+        # A free scale or gauge does not couple with f: the smallest damping makes it invertible and changes nothing.
+        scale, factor, _, factorised = self._factorise(system, 1e-9)
+        unit = torch.zeros_like(scale)
+        unit[column] = scale[column]
+        variance = scale[column] * torch.cholesky_solve(unit[:, None], factor)[column, 0]
+        return torch.where(factorised & (scale[column] > 0), variance, torch.nan)
+
+
+def _border(per_edge: Tensor) -> Tensor:
+    """(F, D, 6 + t, 6 + t) products per edge -> (F, 6 D + t, 6 D + t) float64: twists per edge, the tail shared."""
+    frames, degree, width, _ = per_edge.shape
+    per_edge = per_edge.double()
+    twists = 6 * degree
+    size = twists + width - 6
+    matrix = torch.zeros(frames, size, size, dtype=torch.float64, device=per_edge.device)
+    blocks = matrix[:, :twists, :twists].view(frames, degree, 6, degree, 6)
+    blocks.diagonal(dim1=1, dim2=3).copy_(per_edge[:, :, :6, :6].permute(0, 2, 3, 1))
+    matrix[:, :twists, twists:] = per_edge[:, :, :6, 6:].flatten(1, 2)
+    matrix[:, twists:, :twists] = matrix[:, :twists, twists:].mT
+    matrix[:, twists:, twists:] = per_edge[:, :, 6:, 6:].sum(1)
+    return matrix
+
+
+def _scatter(total: Tensor, chunk: Chunk, matrix: Tensor, adjoint: Tensor) -> None:
+    """total += L^T matrix L with L = [-Ad | 1], in the columns of the chunk."""
+    twists = 6 * chunk.degree
+    to_source = matrix[:, :, :twists] @ -adjoint.flatten(1, 2)
+    source = -adjoint.flatten(1, 2).mT @ to_source[:, :twists]
+    local = torch.cat((torch.cat((source, to_source.mT), dim=2), torch.cat((to_source, matrix), dim=2)), dim=1)
+    total.index_put_((chunk.columns[:, :, None], chunk.columns[:, None, :]), local, accumulate=True)
