@@ -72,6 +72,25 @@ class Provenance:
 
 
 @dataclass(frozen=True, slots=True)
+class Progress:
+    """How far an annotation is.
+
+    Attributes:
+        stage: `scan`, `intrinsics`, `track`, `backend`, `infill` or `depth`, in this order.
+        frames_done: Frames of the stage that are done.
+        frames_total: Frames of the stage, or None while the number is not known.
+    """
+
+    stage: str
+    frames_done: int
+    frames_total: int | None
+
+
+ProgressCallback = Callable[[Progress], None]
+"""Called often, from the thread that annotates. What it raises ends the annotation: the way to cancel."""
+
+
+@dataclass(frozen=True, slots=True)
 class DenseFrame:
     """One frame of the dense stream.
 

@@ -1,0 +1,141 @@
+"""The one entry point of the engine: a warm annotator, and the function that uses one once."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import logging
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import torch
+
+from vipe_core.annotation import Annotation, DenseFrame, Progress, ProgressCallback, Provenance
+from vipe_core.errors import ConfigError
+from vipe_core.pipeline.device import describe_device, resolve_device, set_threads
+from vipe_core.pipeline.presets import Preset, resolve
+from vipe_core.pipeline.provenance import library_versions
+from vipe_core.priors.classical import classical_priors
+from vipe_core.quality import assess
+from vipe_core.slam import Slam, SlamResult
+from vipe_core.slam.selection import Report
+from vipe_core.video import open_source
+from vipe_core.video.source import FrameSource
+
+logger = logging.getLogger(__name__)
+
+
+class Annotator:
+    """An engine that is ready to annotate videos one after the other.
+
+    Args:
+        preset: Name of a preset, or a `Preset` of one's own.
+        camera: Camera model to estimate.
+        device: `cpu`, `cuda` or `cuda:N`: where bundle adjustment runs.
+        threads: CPU threads of torch and OpenCV in this process; None takes `OMP_NUM_THREADS` or a few.
+
+    Raises:
+        ConfigError: Preset, camera or device is not on offer.
+    """
+
+    def __init__(
+        self,
+        preset: str | Preset = "classical",
+        camera: str = "pinhole",
+        device: str = "cpu",
+        *,
+        threads: int | None = None,
+    ) -> None:
+        self.preset = resolve(preset, camera)
+        self.device = resolve_device(device)
+        self.threads = set_threads(threads)
+        self._slam = Slam(classical_priors(), self.preset.slam, self.device)
+
+    def annotate(
+        self, path: str | Path, *, name: str | None = None, progress: ProgressCallback | None = None
+    ) -> Annotation:
+        """Poses, camera and quality of a video file or a directory of images; dense depth when it is asked for.
+
+        Args:
+            path: A video file, or a directory of images in order of their names.
+            name: Name of the sequence; the sanitised stem if None.
+            progress: Told how far the annotation is; an exception out of it ends the annotation.
+
+        Raises:
+            InputError, DecodeError: The input cannot be read. Its code and message are meant for the user.
+        """
+        source = open_source(path, name=name)
+
+        def report(stage: str, done: int, total: int | None) -> None:
+            if progress is not None:
+                progress(Progress(stage, done, total))
+
+        with torch.inference_mode():
+            result = self._slam.run(source, report)
+        quality = assess(result, self.preset.slam, source.info.width)
+        timings = dict(result.timings_s)
+        logger.info(
+            "%s: %d frames, %d keyframes, reliable: %s %s",
+            source.info.name,
+            len(result.timestamps_s),
+            len(result.keyframes),
+            quality.reliable,
+            ",".join(quality.reasons),
+        )
+        return Annotation(
+            name=source.info.name,
+            world_from_cam=result.world_from_cam,
+            camera=result.camera.resized(source.info.width, source.info.height),
+            timestamps_s=result.timestamps_s,
+            fps=source.info.fps,
+            keyframes=result.keyframes,
+            scale="relative",
+            depth_kind="z",
+            quality=quality,
+            provenance=self._provenance(source),
+            dense=lambda: self._dense(source, result, timings, report),
+            timings_s=timings,
+        )
+
+    def _provenance(self, source: FrameSource) -> Provenance:
+        info = source.info
+        return Provenance(
+            engine_version=importlib.metadata.version("vipe-cluster"),
+            preset=self.preset.name,
+            config_hash=self.preset.config_hash,
+            device=describe_device(self.device),
+            libraries=library_versions(),
+            providers=self.preset.providers,
+            weights={},
+            source={
+                "name": info.name,
+                "width": info.width,
+                "height": info.height,
+                "codec": info.codec,
+                "pixel_format": info.pixel_format,
+                "size_bytes": info.size_bytes,
+                "rotation_deg": info.rotation_deg,
+            },
+        )
+
+    def _dense(
+        self, source: FrameSource, result: SlamResult, timings: dict[str, float], report: Report
+    ) -> Iterator[DenseFrame]:
+        raise NotImplementedError
+
+
+def annotate(
+    video: str | Path,
+    *,
+    preset: str | Preset = "classical",
+    camera: str = "pinhole",
+    device: str = "cpu",
+    progress: ProgressCallback | None = None,
+) -> Annotation:
+    """Annotate one video; see `Annotator`, which is the better choice for several.
+
+    Example:
+        annotation = vipe_core.annotate("clip.mp4")
+        annotation.world_from_cam, annotation.camera.fov_x_deg, annotation.quality.reliable
+    """
+    return Annotator(preset, camera, device).annotate(video, progress=progress)

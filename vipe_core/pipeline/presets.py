@@ -1,0 +1,86 @@
+"""The presets on offer: which family provides each role, and the settings that go with it."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+from dataclasses import dataclass, field
+
+from vipe_core.errors import ConfigError
+from vipe_core.slam.settings import SlamSettings
+
+CAMERAS = ("pinhole",)
+
+
+@dataclass(frozen=True, slots=True)
+class Preset:
+    """Everything that determines a result besides the input and the device.
+
+    Attributes:
+        name: Name that users choose it by.
+        camera: Camera model that is estimated.
+        matcher: Provider of dense matching.
+        sparse: Provider of sparse tracks.
+        intrinsics: Provider of the initial camera.
+        depth: Provider of dense depth.
+        slam: Settings of the SLAM stage.
+    """
+
+    name: str
+    camera: str
+    matcher: str
+    sparse: str
+    intrinsics: str
+    depth: str
+    slam: SlamSettings = field(default_factory=SlamSettings)
+
+    def canonical_json(self) -> str:
+        """All fields, keys sorted, no white space: equal presets give equal text."""
+        return json.dumps(dataclasses.asdict(self), sort_keys=True, separators=(",", ":"))
+
+    @property
+    def config_hash(self) -> str:
+        """First 16 hex digits of the SHA-256 of `canonical_json`."""
+        return hashlib.sha256(self.canonical_json().encode()).hexdigest()[:16]
+
+    @property
+    def providers(self) -> dict[str, str]:
+        """Role -> provider."""
+        return {
+            "dense_matching": self.matcher,
+            "sparse_tracks": self.sparse,
+            "intrinsics_init": self.intrinsics,
+            "dense_depth": self.depth,
+        }
+
+
+_PRESETS = {
+    "classical": Preset(
+        name="classical",
+        camera="pinhole",
+        matcher="classical.dis_flow",
+        sparse="classical.lucas_kanade",
+        intrinsics="classical.two_view_focal",
+        depth="classical.plane_sweep",
+    )
+}
+
+PRESETS = tuple(_PRESETS)
+
+
+def resolve(preset: str | Preset, camera: str = "pinhole") -> Preset:
+    """The preset of that name, for that camera model.
+
+    Raises:
+        ConfigError: It is not on offer; the message lists what is.
+    """
+    if isinstance(preset, Preset):
+        found = preset
+    elif preset in _PRESETS:
+        found = _PRESETS[preset]
+    else:
+        raise ConfigError(f"unknown preset {preset!r}; on offer: {', '.join(PRESETS)}")
+    if camera not in CAMERAS:
+        raise ConfigError(f"camera model {camera!r} is not on offer for annotation; on offer: {', '.join(CAMERAS)}")
+    return dataclasses.replace(found, camera=camera)

@@ -1,0 +1,77 @@
+"""The verdict on a result, with reasons. Everything is judged from the result itself; no ground truth is involved.
+
+Reason codes are stable: they are stored with every video.
+
+    few_frames          fewer frames than the initialisation wants
+    few_keyframes       the camera moved too little for a well-connected graph
+    static_camera       no camera motion: poses are identity, depth and focal length are not measured
+    pure_rotation       no parallax: rotations are measured, positions and depth are not
+    low_parallax        little parallax: positions and depth are weak
+    low_texture         most of the picture could not be measured
+    focal_unobservable  the focal length is the initial guess, or no better than one
+    high_residual       the measurements that fit, fit badly
+    low_inliers         much of the picture contradicts the camera motion (moving objects, or a wrong solution)
+    interpolated_frames frames whose own pose fit failed
+"""
+
+from __future__ import annotations
+
+from vipe_core.annotation import Quality, Reliability
+from vipe_core.slam.settings import SlamSettings
+from vipe_core.slam.system import SlamResult
+
+_MIN_FRAMES = 8
+_MIN_KEYFRAMES = 5
+_LOW_PARALLAX_DEG = 1.0
+_LOW_COVERAGE = 0.35
+_HIGH_RESIDUAL_RATIO = 0.8 / 640
+_LOW_INLIERS = 0.7
+_VERY_LOW_INLIERS = 0.45
+_POSED_INLIERS = 0.1
+_MAX_INTERPOLATED = 0.02
+
+
+def assess(result: SlamResult, settings: SlamSettings, source_width: int) -> Quality:
+    """Judge a SLAM result.
+
+    Args:
+        source_width: Width of the source video; residuals are reported in its pixels.
+    """
+    found = result.map
+    reasons: list[str] = []
+    fatal = False
+    if len(result.timestamps_s) < _MIN_FRAMES:
+        reasons.append("few_frames")
+    if result.motion == "static":
+        reasons.append("static_camera")
+    else:
+        if len(result.keyframes) < _MIN_KEYFRAMES:
+            reasons.append("few_keyframes")
+        if result.motion == "rotation":
+            reasons.append("pure_rotation")
+        elif found.parallax_deg < _LOW_PARALLAX_DEG:
+            reasons.append("low_parallax")
+        if found.coverage < _LOW_COVERAGE:
+            reasons.append("low_texture")
+        # Written so that a NaN residual, of a map without a single measurement, counts as high.
+        if not found.residual_px <= _HIGH_RESIDUAL_RATIO * result.working.width:
+            reasons.append("high_residual")
+            fatal = True
+        if found.inlier_ratio < _LOW_INLIERS:
+            reasons.append("low_inliers")
+            fatal = fatal or found.inlier_ratio < _VERY_LOW_INLIERS
+        if float((result.frame_inlier_ratio < _POSED_INLIERS).mean()) > _MAX_INTERPOLATED:
+            reasons.append("interpolated_frames")
+    if not result.focal.observed or result.focal.sigma_ratio > settings.focal_doubt_sigma:
+        reasons.append("focal_unobservable")
+    reliable: Reliability = "no" if fatal else "doubtful" if reasons else "yes"
+    return Quality(
+        reliable=reliable,
+        reasons=tuple(reasons),
+        residual_px=found.residual_px * source_width / result.working.width,
+        inlier_ratio=found.inlier_ratio,
+        coverage=found.coverage,
+        parallax_deg=found.parallax_deg,
+        focal_sigma_ratio=result.focal.sigma_ratio,
+        frame_inlier_ratio=result.frame_inlier_ratio,
+    )

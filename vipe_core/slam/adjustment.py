@@ -1,0 +1,185 @@
+"""From the keyframe map and the graph to one bundle adjustment, and back.
+
+Robust annealing: a redescending kernel ignores whatever starts far away, so every adjustment runs a schedule of kernels
+from wide to narrow.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from vipe_core.ba import solve
+from vipe_core.ba.problem import Free, Options, Priors, Problem, Result, RobustKernel, State, Status
+from vipe_core.slam.graph import Graph
+from vipe_core.slam.keyframes import KeyframeMap
+from vipe_core.slam.settings import SlamSettings
+from vipe_core.slam.smoothness import smooth_inverse_depth
+
+logger = logging.getLogger(__name__)
+
+Array = NDArray[Any]
+
+_FAILED = (Status.SINGULAR, Status.NON_FINITE)
+
+
+@dataclass(frozen=True, slots=True)
+class Step:
+    """One kernel of an annealing schedule.
+
+    Attributes:
+        robust: Kernel of the residual norm.
+        scale: Its scale as a multiple of `SlamSettings.robust_scale_px`.
+        iterations: Bound on solver steps.
+    """
+
+    robust: RobustKernel
+    scale: float
+    iterations: int
+
+
+FROM_SCRATCH = (Step("huber", 1.0, 12), Step("geman_mcclure", 4.0, 8), Step("geman_mcclure", 1.0, 8))
+"""The start may be anything: a convex kernel first."""
+
+TRACK = (Step("geman_mcclure", 4.0, 4), Step("geman_mcclure", 1.0, 4))
+"""One new pose that motion-only tracking has brought within a few pixels."""
+
+REFINE = (Step("geman_mcclure", 4.0, 10), Step("geman_mcclure", 1.0, 15))
+"""Everything is near its place."""
+
+
+@dataclass(frozen=True, slots=True)
+class FocalPrior:
+    """What the initialisation knows of the focal length: log(fx) at the working size and its standard deviation."""
+
+    log_focal: float
+    sigma: float
+
+
+class Adjuster:
+    """Runs adjustments on one device.
+
+    Args:
+        focal_prior: Holds log(fx) softly whenever the focal length is free.
+    """
+
+    def __init__(self, settings: SlamSettings, device: torch.device, focal_prior: FocalPrior, scale_px: float) -> None:
+        self.settings = settings
+        self.device = device
+        self.focal_prior = focal_prior
+        self.robust_scale_px = settings.robust_scale_px * scale_px
+
+    def adjust(
+        self,
+        keyframes: KeyframeMap,
+        graph: Graph,
+        frames: Sequence[int],
+        fixed_poses: Sequence[int],
+        schedule: Sequence[Step],
+        *,
+        edges: Sequence[tuple[int, int]] | None = None,
+        free_focal: bool = False,
+        free_depth: bool = True,
+    ) -> Result | None:
+        """Adjust the keyframes `frames` with the edges among them; writes the result into `keyframes`.
+
+        Args:
+            fixed_poses: Keyframes of `frames` whose poses hold the gauge.
+            edges: Use these edges only.
+
+        Returns:
+            The last solve, or None when nothing could be solved and the map is as it was.
+        """
+        edges = graph.among(frames) if edges is None else list(edges)
+        if not edges:
+            return None
+        number = {k: row for row, k in enumerate(frames)}
+        held = set(fixed_poses)
+        poses = np.stack([keyframes.pose(k) for k in frames])
+        depths = np.stack([keyframes.depth(k) for k in frames])
+        measured = graph.read(edges, number, keyframes, self.device)
+        prior, prior_weight = self._depth_prior(keyframes, graph, frames, edges, number, depths)
+        problem = Problem(
+            camera_model="pinhole",
+            grid=keyframes.grid,
+            edges=measured,
+            free=Free(
+                poses=torch.tensor([k not in held for k in frames], device=self.device),
+                inverse_depth=torch.full((len(frames),), free_depth, dtype=torch.bool, device=self.device),
+                focal=free_focal,
+            ),
+            priors=Priors(
+                inverse_depth=prior if free_depth else None,
+                inverse_depth_weight=prior_weight if free_depth else None,
+                log_focal=self.focal_prior.log_focal if free_focal else None,
+                log_focal_sigma=self.focal_prior.sigma,
+            ),
+        )
+        state = self._state(poses, depths, keyframes.intrinsics)
+        result = self.anneal(problem, state, schedule)
+        if result is None:
+            return None
+        new_poses = result.state.cam_from_world.cpu().numpy()
+        new_depths = result.state.inverse_depth.cpu().numpy()
+        for row, k in enumerate(frames):
+            keyframes.set_pose(k, new_poses[row])
+            keyframes.set_depth(k, new_depths[row])
+        keyframes.intrinsics = result.state.intrinsics.cpu().numpy().astype(np.float64)
+        return result
+
+    def anneal(self, problem: Problem, state: State, schedule: Sequence[Step]) -> Result | None:
+        """Solve with each kernel of the schedule in turn; None when the very first solve fails."""
+        result: Result | None = None
+        for step in schedule:
+            options = Options(
+                max_iterations=step.iterations,
+                robust=step.robust,
+                robust_scale_px=step.scale * self.robust_scale_px,
+                relative_tolerance=1e-3 if step is not schedule[-1] else 1e-4,
+            )
+            solved = solve(problem, state if result is None else result.state, options)
+            if solved.status is Status.EMPTY:
+                return result
+            if solved.status in _FAILED:
+                logger.warning("bundle adjustment ended %s after %d steps", solved.status, solved.iterations)
+                return result
+            result = solved
+        return result
+
+    def motion_only(self, problem: Problem, state: State, schedule: Sequence[Step]) -> Result | None:
+        """`anneal` with every inverse depth and the focal length held."""
+        held = torch.zeros_like(problem.free.inverse_depth)
+        free = replace(problem.free, inverse_depth=held, focal=False, distortion=False)
+        return self.anneal(replace(problem, free=free, priors=Priors()), state, schedule)
+
+    def _state(self, poses: Array, depths: Array, intrinsics: Array) -> State:
+        return State(
+            cam_from_world=torch.from_numpy(np.ascontiguousarray(poses)).to(self.device),
+            inverse_depth=torch.from_numpy(np.ascontiguousarray(depths)).to(self.device),
+            intrinsics=torch.from_numpy(np.array(intrinsics, dtype=np.float64)).to(self.device),
+        )
+
+    def _depth_prior(
+        self,
+        keyframes: KeyframeMap,
+        graph: Graph,
+        frames: Sequence[int],
+        edges: Sequence[tuple[int, int]],
+        number: dict[int, int],
+        depths: Array,
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        confidence = np.zeros(depths.shape, dtype=np.float32)
+        for i, j in edges:
+            confidence[number[i]] += graph[i, j].weight.mean(axis=1) * keyframes.static(i)
+        prior = np.stack(
+            [smooth_inverse_depth(depths[row], confidence[row], keyframes.grid) for row in range(len(frames))]
+        )
+        median = max(float(np.median(depths)), 1e-6)
+        information = np.full(depths.shape, self.settings.depth_prior_weight / median**2, dtype=np.float32)
+        return torch.from_numpy(prior).to(self.device), torch.from_numpy(information).to(self.device)

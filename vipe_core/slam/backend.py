@@ -1,0 +1,116 @@
+"""The backend: adjusts every keyframe at once, with the focal length free where it can be observed (section 3.1)."""
+
+from __future__ import annotations
+
+import logging
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vipe_core.ba.problem import Result
+from vipe_core.slam.adjustment import REFINE, Adjuster
+from vipe_core.slam.masks import moving_cells
+from vipe_core.slam.proximity import close_pairs, loop_edges
+from vipe_core.slam.reprojection import Reprojector
+from vipe_core.slam.settings import SlamSettings
+from vipe_core.slam.tracking import MeasuredGraph
+
+logger = logging.getLogger(__name__)
+
+Array = NDArray[Any]
+
+_FOV_RANGE_DEG = (12.0, 150.0)
+
+
+@dataclass(frozen=True, slots=True)
+class FocalReport:
+    """What the last global adjustment says about the focal length.
+
+    Attributes:
+        sigma_ratio: Inflated 1-sigma of the focal length as a share of it.
+        observed: Whether the adjustment determined it; otherwise it is the initialisation's.
+    """
+
+    sigma_ratio: float
+    observed: bool
+
+
+class Backend:
+    """Global adjustment of the map that `MeasuredGraph` holds."""
+
+    def __init__(
+        self,
+        measured: MeasuredGraph,
+        adjuster: Adjuster,
+        reprojector: Reprojector,
+        settings: SlamSettings,
+        working_width: int,
+    ) -> None:
+        self._measured = measured
+        self._keyframes = measured.keyframes
+        self._adjuster = adjuster
+        self._reprojector = reprojector
+        self._settings = settings
+        self._width = working_width
+        self.focal = FocalReport(adjuster.focal_prior.sigma, observed=False)
+
+    def run(self) -> Result | None:
+        """Add edges between keyframes that overlap, adjust everything, renormalise the scale to median depth 1."""
+        if len(self._keyframes) < 2:
+            return None
+        self._connect_loops()
+        result = self._adjust()
+        if self._mask_moving():
+            result = self._adjust() or result
+        self._keyframes.normalise_scale()
+        return result
+
+    def _connect_loops(self) -> None:
+        count = len(self._keyframes)
+        limit = max(1, round(self._settings.loop_edges_per_keyframe * count))
+        scale = self._width / 640.0
+        pairs = close_pairs(
+            self._reprojector,
+            self._keyframes,
+            range(count),
+            range(count),
+            self._settings.proximity_px * scale,
+            self._settings.proximity_overlap,
+        )
+        existing = sum(1 for i, j in self._measured.graph if i - j > self._settings.neighbours)
+        for pair in loop_edges(pairs, self._measured.graph, limit - existing):
+            self._measured.connect(
+                pair.target, pair.source, guided=True, min_consistent=self._settings.min_consistent
+            )
+
+    def _adjust(self) -> Result | None:
+        """Adjust with a free focal length; take the result back and hold it when the data does not determine it."""
+        frames = range(len(self._keyframes))
+        before = self._keyframes.snapshot()
+        result = self._adjuster.adjust(
+            self._keyframes, self._measured.graph, frames, (0,), REFINE, free_focal=True
+        )
+        sigma = math.inf
+        if result is not None and math.isfinite(result.log_focal_sigma):
+            sigma = self._settings.focal_sigma_inflation * result.log_focal_sigma
+        fov_deg = math.degrees(2 * math.atan(self._width / 2 / float(self._keyframes.intrinsics[0])))
+        if sigma <= self._settings.focal_hold_sigma and _FOV_RANGE_DEG[0] < fov_deg < _FOV_RANGE_DEG[1]:
+            self.focal = FocalReport(sigma, observed=True)
+            return result
+        logger.info("focal length held: inflated sigma %.3f, field of view %.1f deg", sigma, fov_deg)
+        self.focal = FocalReport(self._adjuster.focal_prior.sigma, observed=False)
+        self._keyframes.restore(before)
+        return self._adjuster.adjust(self._keyframes, self._measured.graph, frames, (0,), REFINE)
+
+    def _mask_moving(self) -> bool:
+        """Refresh the motion masks; whether any keyframe's mask changed by a visible share of its cells."""
+        changed = 0.0
+        threshold_px = 2 * self._adjuster.robust_scale_px
+        for k in range(len(self._keyframes)):
+            static = ~moving_cells(self._reprojector, self._keyframes, self._measured.graph, k, threshold_px)
+            changed = max(changed, float(np.mean(static != self._keyframes.static(k))))
+            self._keyframes.set_static(k, static)
+        return changed > 0.02

@@ -1,0 +1,87 @@
+"""The graph of measurements between keyframes.
+
+It keeps what the matcher measured. Masks are applied when edges are read, and robust kernels inside the adjustment, so
+that either can change without matching again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from vipe_core.ba.problem import Edges
+from vipe_core.priors.protocols import Match
+from vipe_core.slam.keyframes import KeyframeMap
+
+Array = NDArray[Any]
+_AGREE_PX = 2.0
+
+
+def fuse(dense: Match, sparse: Match) -> Match:
+    """One measurement per cell out of dense flow and splatted tracks (paper section 3.2, sparse constraint).
+
+    The sum of two quadratic terms in the same reprojection is one term at their weighted mean, up to a constant, so the
+    fused edge costs the adjustment no more than the dense one alone. Where the two disagree by more than
+    `_AGREE_PX` they measure different surfaces, and the dense one, which has been checked forward and backward, stays.
+    """
+    apart = np.linalg.norm(sparse.target_px - dense.target_px, axis=1, keepdims=True) > _AGREE_PX
+    measured = dense.weight.sum(axis=1, keepdims=True) > 0
+    extra = np.where(apart & measured, np.float32(0), sparse.weight)
+    weight = dense.weight + extra
+    share = np.divide(extra, weight, out=np.zeros_like(weight), where=weight > 0)
+    target_px = dense.target_px + share * (sparse.target_px - dense.target_px)
+    return Match(target_px.astype(np.float32), weight.astype(np.float32), dense.consistent)
+
+
+class Graph:
+    """Directed measurements between numbered keyframes."""
+
+    def __init__(self) -> None:
+        self._matches: dict[tuple[int, int], Match] = {}
+
+    def __len__(self) -> int:
+        return len(self._matches)
+
+    def __contains__(self, edge: tuple[int, int]) -> bool:
+        return edge in self._matches
+
+    def __getitem__(self, edge: tuple[int, int]) -> Match:
+        return self._matches[edge]
+
+    def add(self, source: int, target: int, match: Match) -> None:
+        self._matches[source, target] = match
+
+    def __iter__(self) -> Iterator[tuple[int, int]]:
+        """Edges in a fixed order: by source, then by target."""
+        return iter(sorted(self._matches))
+
+    def among(self, frames: Iterable[int]) -> list[tuple[int, int]]:
+        """The edges with both ends in `frames`, in order."""
+        inside = set(frames)
+        return [edge for edge in self if edge[0] in inside and edge[1] in inside]
+
+    def read(
+        self, edges: list[tuple[int, int]], number: Mapping[int, int], keyframes: KeyframeMap, device: torch.device
+    ) -> Edges:
+        """`edges` for the solver, with the moving cells of the source masked out.
+
+        Args:
+            number: Keyframe number -> frame number of the problem.
+        """
+        cells = keyframes.grid.num_cells
+        target_px = np.empty((len(edges), cells, 2), dtype=np.float32)
+        weight = np.empty((len(edges), cells, 2), dtype=np.float32)
+        for row, (i, j) in enumerate(edges):
+            match = self._matches[i, j]
+            target_px[row] = match.target_px
+            np.multiply(match.weight, keyframes.static(i)[:, None], out=weight[row])
+        return Edges(
+            source=torch.tensor([number[i] for i, _ in edges], dtype=torch.int64, device=device),
+            target=torch.tensor([number[j] for _, j in edges], dtype=torch.int64, device=device),
+            target_px=torch.from_numpy(target_px).to(device),
+            weight=torch.from_numpy(weight).to(device),
+        )

@@ -1,0 +1,100 @@
+"""The keyframe map: what the SLAM stage knows about each keyframe, in arrays that grow with the clip."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vipe_core.ba.problem import Grid
+from vipe_core.slam.selection import Keyframe
+
+Array = NDArray[Any]
+
+
+class KeyframeMap:
+    """Poses, inverse depths and features of keyframes 0..K-1, and the intrinsics they share.
+
+    Attributes:
+        frame_index: (K,) frame of the video behind each keyframe.
+        times_s: (K,) its presentation time.
+        features: The matcher's features of each.
+        cam_from_world: (K, 4, 4) float64.
+        inverse_depth: (K, P) float32, positive.
+        static: (K, P) bool, False on cells that appear to move by themselves.
+        intrinsics: (4,) float64 `Camera.index_params` at the working size.
+    """
+
+    def __init__(self, grid: Grid, intrinsics: Array) -> None:
+        self.grid = grid
+        self.intrinsics: NDArray[np.float64] = np.array(intrinsics, dtype=np.float64)
+        self.frame_index: list[int] = []
+        self.times_s: list[float] = []
+        self.features: list[Any] = []
+        self._poses: list[NDArray[np.float64]] = []
+        self._depths: list[NDArray[np.float32]] = []
+        self._static: list[NDArray[np.bool_]] = []
+
+    def __len__(self) -> int:
+        return len(self.frame_index)
+
+    def append(self, keyframe: Keyframe, time_s: float, cam_from_world: Array, inverse_depth: Array) -> int:
+        """Add a keyframe and return its number."""
+        self.frame_index.append(keyframe.index)
+        self.times_s.append(time_s)
+        self.features.append(keyframe.features)
+        self._poses.append(np.array(cam_from_world, dtype=np.float64))
+        self._depths.append(np.array(inverse_depth, dtype=np.float32))
+        self._static.append(np.ones(self.grid.num_cells, dtype=np.bool_))
+        return len(self) - 1
+
+    def pose(self, k: int) -> NDArray[np.float64]:
+        return self._poses[k]
+
+    def depth(self, k: int) -> NDArray[np.float32]:
+        return self._depths[k]
+
+    def static(self, k: int) -> NDArray[np.bool_]:
+        return self._static[k]
+
+    def set_pose(self, k: int, cam_from_world: Array) -> None:
+        self._poses[k] = np.array(cam_from_world, dtype=np.float64)
+
+    def set_depth(self, k: int, inverse_depth: Array) -> None:
+        self._depths[k] = np.array(inverse_depth, dtype=np.float32)
+
+    def set_static(self, k: int, static: Array) -> None:
+        self._static[k] = np.array(static, dtype=np.bool_)
+
+    def poses(self) -> NDArray[np.float64]:
+        """(K, 4, 4) copy of all poses."""
+        return np.stack(self._poses)
+
+    def depths(self) -> NDArray[np.float32]:
+        """(K, P) copy of all inverse depths."""
+        return np.stack(self._depths)
+
+    def statics(self) -> NDArray[np.bool_]:
+        """(K, P) copy of all motion masks."""
+        return np.stack(self._static)
+
+    def snapshot(self) -> tuple[Array, Array, Array]:
+        """Poses, inverse depths and intrinsics, to `restore` later."""
+        return self.poses(), self.depths(), self.intrinsics.copy()
+
+    def restore(self, snapshot: tuple[Array, Array, Array]) -> None:
+        poses, depths, intrinsics = snapshot
+        for k in range(len(poses)):
+            self.set_pose(k, poses[k])
+            self.set_depth(k, depths[k])
+        self.intrinsics = np.array(intrinsics, dtype=np.float64)
+
+    def normalise_scale(self) -> None:
+        """Rescale the world so that the median inverse depth is 1. Leaves every reprojection as it is."""
+        median = float(np.median(self.depths()))
+        if not np.isfinite(median) or median <= 0:
+            return
+        for k in range(len(self)):
+            self._depths[k] = (self._depths[k] / median).astype(np.float32)
+            self._poses[k][:3, 3] *= median

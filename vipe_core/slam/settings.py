@@ -1,0 +1,59 @@
+"""Every number that steers the SLAM stage, in one frozen value.
+
+Lengths are pixels of a working image that is 640 wide; `SlamSettings.scaled_px` converts them to the actual width.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True, slots=True)
+class SlamSettings:
+    """Settings of keyframe selection, tracking, global bundle adjustment and infill.
+
+    Attributes:
+        working_area_px: Pixel budget of the working image; a frame is never enlarged.
+        grid_stride: Working pixels per cell of the inverse-depth grid.
+        keyframe_motion_px: Median textured displacement that makes a new keyframe.
+        min_keyframes: The displacement is lowered until a moving clip has this many keyframes.
+        static_motion_px: A clip whose every frame stays below this displacement has no camera motion.
+        sample_frames: Bound on the frames held for the intrinsics initialisation.
+        neighbours: Previous keyframes that a new one is matched with.
+        window: Keyframes that the sliding window optimises.
+        backend_at: Keyframe counts at which a global adjustment runs in between.
+        depth_prior_weight: Information of the smoothness prior, px^2 per (inverse depth / its median)^2.
+        robust_scale_px: Scale of the Geman-McClure kernel after annealing.
+        loop_edges_per_keyframe: Bound on proximity edges of the global graph.
+        proximity_px: Largest mean induced displacement of a proximity edge.
+        proximity_overlap: Least share of cells seen by both ends of a proximity edge.
+        min_consistent: Least forward-backward consistency of a proximity edge.
+        focal_sigma_inflation: Factor on the solver's formal 1-sigma of log focal that makes it match real errors.
+        focal_hold_sigma: An inflated sigma above this holds the focal length at its initial value.
+        focal_doubt_sigma: An inflated sigma above this makes the result doubtful.
+        infill_batch: Frames posed in one motion-only adjustment.
+    """
+
+    working_area_px: int = 640 * 480
+    grid_stride: int = 8
+    keyframe_motion_px: float = 24.0
+    min_keyframes: int = 8
+    static_motion_px: float = 1.0
+    sample_frames: int = 128
+    neighbours: int = 2
+    window: int = 8
+    backend_at: tuple[int, ...] = (8, 16, 64, 256)
+    depth_prior_weight: float = 2.0
+    robust_scale_px: float = 3.0
+    loop_edges_per_keyframe: float = 0.5
+    proximity_px: float = 80.0
+    proximity_overlap: float = 0.6
+    min_consistent: float = 0.4
+    focal_sigma_inflation: float = 30.0
+    focal_hold_sigma: float = 0.3
+    focal_doubt_sigma: float = 0.05
+    infill_batch: int = 16
+
+    def scaled_px(self, length_px: float, working_width: int) -> float:
+        """A length stated for a 640 px wide image, in pixels of the actual working image."""
+        return length_px * working_width / 640.0

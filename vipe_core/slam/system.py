@@ -1,0 +1,173 @@
+"""The SLAM stage as a whole: from a frame source to a pose for every frame (paper section 3.1, steps 1 to 5)."""
+
+from __future__ import annotations
+
+import logging
+import math
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from vipe_core.ba.problem import Grid
+from vipe_core.cameras import Camera
+from vipe_core.geometry.arrays import inverse
+from vipe_core.priors.protocols import IntrinsicsEstimate, PriorFamily
+from vipe_core.slam.adjustment import Adjuster, FocalPrior
+from vipe_core.slam.backend import Backend, FocalReport
+from vipe_core.slam.diagnostics import MapReport, examine
+from vipe_core.slam.graph import Graph
+from vipe_core.slam.infill import Infill
+from vipe_core.slam.keyframes import KeyframeMap
+from vipe_core.slam.reprojection import Reprojector
+from vipe_core.slam.selection import Report, Selection, select_keyframes
+from vipe_core.slam.settings import SlamSettings
+from vipe_core.slam.tracking import MeasuredGraph, Tracker
+from vipe_core.slam.working import WorkingSize, working_size
+from vipe_core.video.source import FrameSource
+
+logger = logging.getLogger(__name__)
+
+Motion = Literal["general", "rotation", "static"]
+
+
+@dataclass(frozen=True, slots=True)
+class SlamResult:
+    """What the SLAM stage hands on.
+
+    Attributes:
+        world_from_cam: (N, 4, 4) float64; the world is the first camera.
+        frame_inlier_ratio: (N,) float32 share of each frame's measurements that its pose explains.
+        timestamps_s: (N,) float64.
+        keyframes: (K,) int64 frame indices.
+        inverse_depth: (K, P) float32 of each keyframe's cells, along the rays of the camera model.
+        static: (K, P) bool, False on cells that appear to move by themselves.
+        working: Size of the images that the cells belong to.
+        camera: At the working size.
+        motion: What kind of camera motion was found.
+        focal: What is known of the focal length.
+        map: Diagnostics, with the confidence of every inverse depth.
+        timings_s: Wall seconds per stage.
+    """
+
+    world_from_cam: NDArray[np.float64]
+    frame_inlier_ratio: NDArray[np.float32]
+    timestamps_s: NDArray[np.float64]
+    keyframes: NDArray[np.int64]
+    inverse_depth: NDArray[np.float32]
+    static: NDArray[np.bool_]
+    working: WorkingSize
+    camera: Camera
+    motion: Motion
+    focal: FocalReport
+    map: MapReport
+    timings_s: dict[str, float]
+
+    @property
+    def grid(self) -> Grid:
+        return self.working.grid
+
+
+class Slam:
+    """The stage with its components; reusable for any number of videos, one at a time."""
+
+    def __init__(self, priors: PriorFamily, settings: SlamSettings, device: torch.device) -> None:
+        self._priors = priors
+        self._settings = settings
+        self._device = device
+
+    def run(self, source: FrameSource, report: Report) -> SlamResult:
+        """Pose every frame of the video.
+
+        Args:
+            report: Told the stage and how far it is; what it raises ends the run.
+
+        Raises:
+            InputError, DecodeError: From the source; EmptyMedia when it holds no frame.
+        """
+        timings: dict[str, float] = {}
+        size = working_size(source.info.width, source.info.height, self._settings.working_area_px)
+        with _timed(timings, "scan"):
+            selection = select_keyframes(source, size, self._priors.matcher, self._settings, report)
+        with _timed(timings, "intrinsics"):
+            estimate = self._initial_camera(source, selection, size)
+            report("intrinsics", 1, 1)
+        reprojector = Reprojector("pinhole", size.grid)
+        keyframes = KeyframeMap(size.grid, estimate.camera.index_params())
+        graph = Graph()
+        prior = FocalPrior(math.log(estimate.camera.focal_px), estimate.log_focal_sigma)
+        adjuster = Adjuster(self._settings, self._device, prior, self._settings.scaled_px(1.0, size.width))
+        measured = MeasuredGraph(keyframes, graph, self._priors.matcher, self._priors.tracker, reprojector)
+        backend = Backend(measured, adjuster, reprojector, self._settings, size.width)
+        static = selection.max_motion_px < self._settings.scaled_px(self._settings.static_motion_px, size.width)
+        chosen = selection.keyframes[:1] if static else selection.keyframes
+        tracker = Tracker(
+            measured, adjuster, reprojector, self._settings, self._settings.scaled_px(1.0, size.width)
+        )
+        with _timed(timings, "track"):
+            for done, keyframe in enumerate(chosen, start=1):
+                tracker.add(keyframe, float(selection.timestamps_s[keyframe.index]))
+                if done in self._settings.backend_at and done < len(chosen):
+                    backend.run()
+                report("track", keyframe.index + 1, selection.num_frames)
+        with _timed(timings, "backend"):
+            backend.run()
+            report("backend", 1, 1)
+        found = examine(reprojector, keyframes, graph, adjuster.robust_scale_px)
+        with _timed(timings, "infill"):
+            if static:
+                cam_from_world = np.tile(np.eye(4), (selection.num_frames, 1, 1))
+                frame_inliers = np.ones(selection.num_frames, dtype=np.float32)
+                report("infill", selection.num_frames, selection.num_frames)
+            else:
+                infill = Infill(
+                    keyframes, self._priors.matcher, adjuster, reprojector, self._settings.infill_batch
+                )
+                trajectory = infill.run(source, size, selection.timestamps_s, report)
+                cam_from_world, frame_inliers = trajectory.cam_from_world, trajectory.inlier_ratio
+        world_from_cam = inverse(cam_from_world)
+        return SlamResult(
+            world_from_cam=cam_from_world[0] @ world_from_cam,
+            frame_inlier_ratio=frame_inliers,
+            timestamps_s=selection.timestamps_s,
+            keyframes=np.array(keyframes.frame_index, dtype=np.int64),
+            inverse_depth=keyframes.depths(),
+            static=keyframes.statics(),
+            working=size,
+            camera=_camera(keyframes.intrinsics, size),
+            motion="static" if static else "general",
+            focal=backend.focal,
+            map=found,
+            timings_s=timings,
+        )
+
+    def _initial_camera(self, source: FrameSource, selection: Selection, size: WorkingSize) -> IntrinsicsEstimate:
+        """The initial camera at the working size, with pixels that are square in the source video."""
+        estimate = self._priors.intrinsics.estimate(selection.sample, size.grid)
+        scale_x, scale_y = size.width / source.info.width, size.height / source.info.height
+        focal_px = estimate.camera.focal_px / math.sqrt(scale_x * scale_y)
+        width, height = source.info.width, source.info.height
+        square = Camera("pinhole", (focal_px, focal_px, width / 2, height / 2), width, height)
+        return IntrinsicsEstimate(
+            square.resized(size.width, size.height), estimate.log_focal_sigma, estimate.num_pairs
+        )
+
+
+def _camera(intrinsics: NDArray[np.float64], size: WorkingSize) -> Camera:
+    """The camera value of index parameters: the inverse of `Camera.index_params`."""
+    fx, fy, cx, cy = (float(value) for value in intrinsics)
+    return Camera("pinhole", (fx, fy, cx + 0.5, cy + 0.5), size.width, size.height)
+
+
+@contextmanager
+def _timed(timings: dict[str, float], stage: str) -> Iterator[None]:
+    start = time.perf_counter()
+    try:
+        yield
+    finally:
+        timings[stage] = time.perf_counter() - start

@@ -1,0 +1,57 @@
+"""The working resolution: the size at which frames are matched, and the grid of cells on it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from vipe_core.ba.problem import Grid
+from vipe_core.priors.protocols import WorkingFrame
+from vipe_core.video.source import Frame
+
+_MIN_CELLS = 4
+
+
+@dataclass(frozen=True, slots=True)
+class WorkingSize:
+    """Size of the working image, pixels. Source frames are resized to it, not cropped.
+
+    The two axes may scale slightly differently because both are rounded to whole cells; `Camera.resized` carries that
+    into fx and fy exactly.
+    """
+
+    width: int
+    height: int
+    stride: int = 8
+
+    @property
+    def grid(self) -> Grid:
+        """Cells of the working image; each samples the centre of its block of `stride` x `stride` pixels."""
+        return Grid(self.height // self.stride, self.width // self.stride, float(self.stride), (self.stride - 1) / 2)
+
+    @property
+    def size(self) -> tuple[int, int]:
+        return self.width, self.height
+
+
+def working_size(width: int, height: int, area_px: int, stride: int = 8) -> WorkingSize:
+    """Working size of a video of `width` x `height` pixels: about `area_px`, whole cells, never enlarged.
+
+    A video smaller than a few cells is enlarged to them, the least that a grid needs.
+    """
+    scale = min(1.0, math.sqrt(area_px / (width * height)))
+
+    def whole_cells(length: int) -> int:
+        cells = round(length * scale / stride)
+        return stride * max(_MIN_CELLS, min(cells, length // stride))
+
+    return WorkingSize(whole_cells(width), whole_cells(height), stride)
+
+
+def working_frame(frame: Frame) -> WorkingFrame:
+    """The working frame of a picture that was decoded at the working size."""
+    gray = np.asarray(cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY), dtype=np.uint8)
+    return WorkingFrame(frame.index, gray, frame.rgb)
