@@ -1,0 +1,45 @@
+# `make demo` shows the whole system on sample videos; `make test` checks everything. Both set up .venv first.
+
+VENV := .venv
+VIDEO ?=
+export OMP_WAIT_POLICY ?= passive
+# Ray and matplotlib must not phone home or open windows.
+export RAY_USAGE_STATS_ENABLED := 0
+
+.PHONY: demo test setup lint types unit lock format clean
+
+$(VENV)/.runtime: pyproject.toml requirements.lock scripts/setup.sh
+	@scripts/setup.sh
+	@touch $@
+
+$(VENV)/.dev: pyproject.toml requirements.lock scripts/setup.sh
+	@scripts/setup.sh postgres dev
+	@touch $@ $(VENV)/.runtime
+
+setup: $(VENV)/.dev ## .venv with everything
+
+demo: $(VENV)/.runtime ## run the service on sample videos, or on VIDEO=clip.mp4
+	@$(VENV)/bin/vipectl demo $(VIDEO)
+
+test: setup lint types unit ## everything that CI runs
+
+lint: setup
+	$(VENV)/bin/ruff format --check .
+	$(VENV)/bin/ruff check .
+	$(VENV)/bin/lint-imports
+
+types: setup
+	$(VENV)/bin/mypy
+
+unit: setup
+	$(VENV)/bin/python -m pytest $(PYTEST_ARGS)
+
+format: setup
+	$(VENV)/bin/ruff check --fix .
+	$(VENV)/bin/ruff format .
+
+lock: ## resolve all dependencies anew into requirements.lock
+	scripts/lock.sh
+
+clean: ## remove the environment, caches and demo output
+	rm -rf $(VENV) .cache .mypy_cache .ruff_cache .pytest_cache .hypothesis vipe_output
