@@ -43,6 +43,9 @@ _PLAYLIST_HEADS = (
 )
 _IMAGE_HEADS = (b"\x89PNG", b"\xff\xd8\xff", b"BM", b"II*\0", b"MM\0*", b"8BPS", b"\0\0\x01\0")
 
+# swscale's default conversion truncates (1 to 2 grey levels too dark) and repeats chroma instead of interpolating it.
+_EXACT = Interpolation.ACCURATE_RND | Interpolation.FULL_CHR_H_INT
+
 DEFAULT_FPS = 30.0
 # A step back by more than this is a new clock (a spliced transport stream), not a jittering one.
 _CLOCK_RESET_S = 1.0
@@ -242,7 +245,7 @@ class PictureConverter:
                 "rgb24",
                 src_colorspace=_matrix(frame),
                 dst_colorspace=_matrix(frame),
-                interpolation=Interpolation.AREA if shrinks else Interpolation.BILINEAR,
+                interpolation=int((Interpolation.AREA if shrinks else Interpolation.BILINEAR) | _EXACT),
                 src_color_range=_source_range(frame),
                 dst_color_range=ColorRange.JPEG,
                 threads=1,
@@ -251,8 +254,7 @@ class PictureConverter:
             raise UnsupportedMedia(
                 f"{self._label}: pixels of format {frame.format.name} cannot be converted to RGB; re-encode the video"
             ) from error
-        picture = np.asarray(rgb.to_ndarray(), dtype=np.uint8)
-        return np.ascontiguousarray(np.rot90(picture, -turns)) if turns else picture
+        return np.ascontiguousarray(np.rot90(rgb.to_ndarray(), -turns), dtype=np.uint8)
 
 
 def _matrix(frame: VideoFrame) -> int:

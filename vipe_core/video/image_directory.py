@@ -15,8 +15,8 @@ from vipe_core.video.wire import Request
 
 IMAGE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp"})
 IMAGE_FPS = 30.0
-# The request is one argument of a process, which Linux limits to 128 KiB; a chunk also bounds what one crash costs.
-_PATHS_PER_CHILD = 256
+# The request is one argument of a process, which Linux limits to 128 KiB; a name has up to 255 bytes.
+_IMAGES_PER_CHILD = 128
 
 
 class ImageDirectorySource:
@@ -91,9 +91,9 @@ class ImageDirectorySource:
         """See `FrameSource.frames`."""
         check_range(size, start, stop)
         end = len(self._files) if stop is None else min(stop, len(self._files))
-        for begin in range(start, end, _PATHS_PER_CHILD):
+        for begin in range(start, end, _IMAGES_PER_CHILD):
             # The first image goes along as the measure of size.
-            chunk = [self._files[0], *self._files[begin : min(end, begin + _PATHS_PER_CHILD)]]
+            chunk = [self._files[0], *self._files[begin : min(end, begin + _IMAGES_PER_CHILD)]]
             request = self._request("decode", chunk, self._info.fps, size, 1, None)
             with DecoderProcess(request, self._root.name, self._stall_s) as child:
                 for item in child.frames():
@@ -106,7 +106,8 @@ class ImageDirectorySource:
     ) -> Request:
         return Request(
             task=task,
-            paths=tuple(str(file) for file in files),
+            root=str(self._root),
+            files=tuple(file.name for file in files),
             images=True,
             limits=self._limits,
             size=size,

@@ -55,7 +55,8 @@ def probe(
     size_bytes = file_size_bytes(path)
     request = Request(
         task="probe",
-        paths=(str(path.absolute()),),
+        root=str(path.absolute().parent),
+        files=(path.name,),
         images=False,
         limits=limits or Limits(),
         size=None,

@@ -48,33 +48,31 @@ class DecoderProcess:
         self._label = label
         self._stall_s = stall_s
         self._deadline_s = None if wall_s is None else time.monotonic() + wall_s
-        self._resources = contextlib.ExitStack()
-        self._errors: IO[bytes] = self._resources.enter_context(tempfile.TemporaryFile())
-        read_fd, write_fd = os.pipe()
-        self._resources.callback(os.close, read_fd)
-        try:
-            self._process = subprocess.Popen(
-                # -P: the working directory is no place to import from.
-                [sys.executable, "-P", "-m", "vipe_core.video.decoder_child", request.to_json(), str(write_fd)],
-                stdin=subprocess.PIPE,
-                stdout=subprocess.DEVNULL,
-                stderr=self._errors,
-                pass_fds=(write_fd,),
-                start_new_session=True,
-                env=_child_environment(),
-            )
-        except BaseException:
-            self._resources.close()
-            raise
-        finally:
-            os.close(write_fd)
-        self._fd = read_fd
-        with contextlib.suppress(OSError):
-            # A larger pipe means fewer switches; an unprivileged user may have used up the allowance.
-            fcntl.fcntl(read_fd, fcntl.F_SETPIPE_SZ, _PIPE_BYTES)
-        os.set_blocking(read_fd, False)
-        self._selector = self._resources.enter_context(selectors.DefaultSelector())
-        self._selector.register(read_fd, selectors.EVENT_READ)
+        with contextlib.ExitStack() as resources:
+            self._errors: IO[bytes] = resources.enter_context(tempfile.TemporaryFile())
+            self._fd, write_fd = os.pipe()
+            resources.callback(os.close, self._fd)
+            try:
+                self._process = subprocess.Popen(
+                    # -P: the working directory is no place to import from.
+                    [sys.executable, "-P", "-m", "vipe_core.video.decoder_child", request.to_json(), str(write_fd)],
+                    stdin=subprocess.PIPE,
+                    stdout=subprocess.DEVNULL,
+                    stderr=self._errors,
+                    pass_fds=(write_fd,),
+                    start_new_session=True,
+                    env=_child_environment(),
+                )
+            finally:
+                os.close(write_fd)
+            resources.callback(self._kill)
+            with contextlib.suppress(OSError):
+                # A larger pipe means fewer switches; an unprivileged user may have used up the allowance.
+                fcntl.fcntl(self._fd, fcntl.F_SETPIPE_SZ, _PIPE_BYTES)
+            os.set_blocking(self._fd, False)
+            self._selector = resources.enter_context(selectors.DefaultSelector())
+            self._selector.register(self._fd, selectors.EVENT_READ)
+            self._resources = resources.pop_all()
 
     @property
     def pid(self) -> int:
@@ -88,15 +86,16 @@ class DecoderProcess:
 
     def close(self) -> None:
         """Kill the child and everything it started, wait for it, release the pipe. Safe to call twice."""
-        if self._fd < 0:
-            return
-        with contextlib.suppress(ProcessLookupError, PermissionError):
-            os.killpg(self._process.pid, signal.SIGKILL)
-        self._process.wait()
+        self._resources.close()
+
+    def _kill(self) -> None:
+        # Until it is reaped the child's id cannot belong to somebody else, nor can its process group's.
+        if self._process.returncode is None:
+            with contextlib.suppress(ProcessLookupError, PermissionError):
+                os.killpg(self._process.pid, signal.SIGKILL)
+            self._process.wait()
         if self._process.stdin is not None:
             self._process.stdin.close()
-        self._fd = -1
-        self._resources.close()
 
     def document(self) -> dict[str, Any]:
         """The one JSON document of a `probe`.

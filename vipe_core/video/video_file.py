@@ -73,7 +73,8 @@ class VideoFileSource:
             return
         request = Request(
             task="decode",
-            paths=(str(self._path),),
+            root=str(self._path.parent),
+            files=(self._path.name,),
             images=False,
             limits=self._limits,
             size=size,

@@ -11,6 +11,7 @@ import json
 import os
 import struct
 from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import Any
 
 from vipe_core import errors
@@ -61,8 +62,9 @@ class Request:
 
     Attributes:
         task: `probe` describes the media; `decode` sends pictures [start, stop).
-        paths: One video file, or the image files of a directory in order.
-        images: Whether `paths` are images.
+        root: Directory of the files, absolute.
+        files: Name of one video file, or the names of the images in order.
+        images: Whether `files` are images.
         size: (width, height) of the upright picture to send, or None for its own size.
         fps: Frame rate that images are given.
         threads: Decoder threads.
@@ -70,7 +72,8 @@ class Request:
     """
 
     task: str
-    paths: tuple[str, ...]
+    root: str
+    files: tuple[str, ...]
     images: bool
     limits: Limits
     size: tuple[int, int] | None
@@ -80,14 +83,19 @@ class Request:
     threads: int
     stall_s: float
 
+    @property
+    def paths(self) -> tuple[str, ...]:
+        return tuple(str(Path(self.root, file)) for file in self.files)
+
     def to_json(self) -> str:
-        return json.dumps(asdict(self))
+        # As an argument of a process, names that are not UTF-8 survive only unescaped.
+        return json.dumps(asdict(self), ensure_ascii=False)
 
     @classmethod
     def from_json(cls, text: str) -> Request:
         fields: dict[str, Any] = json.loads(text)
         fields["limits"] = Limits(**fields["limits"])
-        fields["paths"] = tuple(fields["paths"])
+        fields["files"] = tuple(fields["files"])
         fields["size"] = tuple(fields["size"]) if fields["size"] else None
         return cls(**fields)
 

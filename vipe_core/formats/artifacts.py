@@ -1,0 +1,212 @@
+"""Writing an annotation as ViPE artifacts: `pose`, `intrinsics`, `depth`, `rgb`, and our own `vipe/NAME_info.json`.
+
+Payload bytes depend on the annotation only (never on time, order of hashing or this machine's paths), and nothing
+appears under its final name before all of it is complete. Upstream keeps its description in a pickle; ours is JSON.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import shutil
+import tempfile
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vipe_core.annotation import Annotation, DenseFrame
+from vipe_core.cameras import Camera
+from vipe_core.errors import EngineError
+from vipe_core.formats.depth_zip import DepthZipWriter
+from vipe_core.formats.layout import artifact_path, info_path
+from vipe_core.video.encode import VideoWriter
+from vipe_core.video.naming import sanitise_name
+
+Attribute = Literal["pose", "intrinsics", "depth", "rgb"]
+ALL_ATTRIBUTES: tuple[Attribute, ...] = ("pose", "intrinsics", "depth", "rgb")
+
+INFO_SCHEMA = 1
+DISK_CAMERA_NAMES = {"pinhole": "PINHOLE", "mei": "MEI", "equirect": "PANORAMA"}
+
+
+@dataclass(frozen=True, slots=True)
+class ArtifactPaths:
+    """What was written; None for an attribute that was not asked for."""
+
+    root: Path
+    name: str
+    info: Path
+    pose: Path | None
+    intrinsics: Path | None
+    camera_txt: Path | None
+    depth: Path | None
+    rgb: Path | None
+
+    @property
+    def files(self) -> tuple[Path, ...]:
+        optional = (self.pose, self.intrinsics, self.camera_txt, self.depth, self.rgb)
+        return (*(path for path in optional if path is not None), self.info)
+
+
+def write_artifacts(
+    annotation: Annotation,
+    root: str | Path,
+    *,
+    attributes: Sequence[Attribute] = ALL_ATTRIBUTES,
+    progress: Callable[[int, int], None] | None = None,
+) -> ArtifactPaths:
+    """Write `annotation` below `root`, consuming its dense stream once (not at all without `depth` and `rgb`).
+
+    An earlier result of the same name is replaced: first its `_info.json` goes, then files change, then the new
+    `_info.json` appears, so that its presence always means a complete sequence.
+
+    Args:
+        annotation: Its name must be a sanitised one.
+        root: Output directory, created if need be.
+        attributes: What to write.
+        progress: Called with (frames done, all frames).
+
+    Raises:
+        ValueError: A name that is not sanitised, or an unknown attribute.
+        EngineError: The dense stream does not match the poses and the camera.
+        OSError: From the file system.
+    """
+    name = annotation.name
+    if name != sanitise_name(name):
+        raise ValueError(f"sequence name {name!r} is not safe in paths; use sanitise_name")
+    unknown = set(attributes) - set(ALL_ATTRIBUTES)
+    if unknown:
+        raise ValueError(f"unknown attributes {sorted(unknown)}; known: {', '.join(ALL_ATTRIBUTES)}")
+    root = Path(root)
+    root.mkdir(parents=True, exist_ok=True)
+    work = Path(tempfile.mkdtemp(prefix=f".{name}.", suffix=".partial", dir=root))
+    try:
+        written = _write_all(annotation, work, attributes, progress)
+        info_path(root, name).unlink(missing_ok=True)
+        moved: dict[str, Path] = {}
+        for key, path in written.items():
+            moved[key] = root / path.relative_to(work)
+            moved[key].parent.mkdir(exist_ok=True)
+            path.replace(moved[key])
+    finally:
+        shutil.rmtree(work, ignore_errors=True)
+    return ArtifactPaths(
+        root=root,
+        name=name,
+        info=moved["info"],
+        pose=moved.get("pose"),
+        intrinsics=moved.get("intrinsics"),
+        camera_txt=moved.get("camera_txt"),
+        depth=moved.get("depth"),
+        rgb=moved.get("rgb"),
+    )
+
+
+def disk_intrinsics(camera: Camera) -> NDArray[np.float32]:
+    """The parameters as they lie on disk: (4,) pinhole, (5,) mei, four zeros for a panorama; half-pixel centres."""
+    return np.array(camera.params or (0.0, 0.0, 0.0, 0.0), dtype=np.float32)
+
+
+def _write_all(
+    annotation: Annotation,
+    work: Path,
+    attributes: Sequence[Attribute],
+    progress: Callable[[int, int], None] | None,
+) -> dict[str, Path]:
+    """Write everything below `work`; key -> path, the info last."""
+    name, count = annotation.name, annotation.num_frames
+    written: dict[str, Path] = {}
+
+    def new(key: str, path: Path) -> Path:
+        path.parent.mkdir(exist_ok=True)
+        written[key] = path
+        return path
+
+    inds = np.arange(count, dtype=np.int64)
+    if "pose" in attributes:
+        path = new("pose", artifact_path(work, name, "pose", "npz"))
+        np.savez(path, data=annotation.world_from_cam.astype(np.float32), inds=inds)
+    if "intrinsics" in attributes:
+        path = new("intrinsics", artifact_path(work, name, "intrinsics", "npz"))
+        np.savez(path, data=np.tile(disk_intrinsics(annotation.camera), (count, 1)), inds=inds)
+        kind = DISK_CAMERA_NAMES[annotation.camera.model]
+        path = new("camera_txt", artifact_path(work, name, "intrinsics", "camera.txt"))
+        path.write_text("".join(f"{index}: {kind}\n" for index in range(count)), encoding="ascii")
+    if "depth" in attributes or "rgb" in attributes:
+        depth = new("depth", artifact_path(work, name, "depth", "zip")) if "depth" in attributes else None
+        rgb = new("rgb", artifact_path(work, name, "rgb", "mp4")) if "rgb" in attributes else None
+        _write_dense(annotation, depth, rgb, progress)
+    new("info", info_path(work, name)).write_text(_info_json(annotation, attributes), encoding="utf-8")
+    return written
+
+
+def _write_dense(
+    annotation: Annotation, depth_path: Path | None, rgb_path: Path | None, progress: Callable[[int, int], None] | None
+) -> None:
+    total = annotation.num_frames
+    done = 0
+    with ExitStack() as stack:
+        depth = stack.enter_context(DepthZipWriter(depth_path)) if depth_path else None
+        rgb = stack.enter_context(VideoWriter(rgb_path, annotation.fps)) if rgb_path else None
+        for frame in annotation.dense():
+            _check_dense(annotation, frame, done)
+            if depth is not None:
+                depth.append(frame.depth)
+            if rgb is not None:
+                rgb.write(frame.rgb)
+            done += 1
+            if progress is not None:
+                progress(done, total)
+        if done != total:
+            raise EngineError(f"{annotation.name}: the dense stream gave {done} of {total} frames")
+
+
+def _check_dense(annotation: Annotation, frame: DenseFrame, expected_index: int) -> None:
+    camera = annotation.camera
+    if frame.index != expected_index or frame.index >= annotation.num_frames:
+        raise EngineError(f"{annotation.name}: the dense stream gave frame {frame.index} as number {expected_index}")
+    if frame.depth.shape != (camera.height, camera.width) or frame.rgb.shape != (camera.height, camera.width, 3):
+        raise EngineError(
+            f"{annotation.name}: frame {frame.index} is not of the camera's size {camera.width}x{camera.height}"
+        )
+
+
+def _info_json(annotation: Annotation, attributes: Sequence[Attribute]) -> str:
+    camera = annotation.camera
+    info = {
+        "schema": INFO_SCHEMA,
+        "name": annotation.name,
+        "num_frames": annotation.num_frames,
+        "attributes": [attribute for attribute in ALL_ATTRIBUTES if attribute in attributes],
+        "width": camera.width,
+        "height": camera.height,
+        "camera": {"model": camera.model, "params": list(camera.params), "fov_x_deg": round(camera.fov_x_deg, 6)},
+        "fps": annotation.fps,
+        "scale": annotation.scale,
+        "depth_kind": annotation.depth_kind,
+        "trajectory_length": annotation.trajectory_length,
+        "quality": annotation.quality.summary(),
+        "frame_inlier_ratio": [round(float(value), 4) for value in annotation.quality.frame_inlier_ratio],
+        "provenance": asdict(annotation.provenance),
+        "keyframes": [int(index) for index in annotation.keyframes],
+        "timestamps_s": [float(value) for value in annotation.timestamps_s],
+    }
+    return json.dumps(_json_ready(info), indent=1, sort_keys=True, allow_nan=False) + "\n"
+
+
+def _json_ready(value: Any) -> Any:
+    """Numbers that JSON cannot hold become null; numpy scalars become plain."""
+    if isinstance(value, dict):
+        return {str(key): _json_ready(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_json_ready(item) for item in value]
+    if isinstance(value, np.generic):
+        value = value.item()
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value

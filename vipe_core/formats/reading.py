@@ -1,0 +1,180 @@
+"""Reading ViPE artifacts back as typed values: ours, and those that the original tool or its datasets hold."""
+
+from __future__ import annotations
+
+import json
+import zipfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vipe_core.annotation import DepthKind
+from vipe_core.cameras import Camera, CameraModel
+from vipe_core.errors import ConfigError, FormatError, VipeError
+from vipe_core.formats.depth_zip import DepthZipReader
+from vipe_core.formats.layout import artifact_path, info_path
+from vipe_core.video.probe import probe
+
+_MODELS: dict[str, tuple[CameraModel, int]] = {
+    "PINHOLE": ("pinhole", 4),
+    "MEI": ("mei", 5),
+    "PANORAMA": ("equirect", 4),
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Artifacts:
+    """One sequence on disk. Poses and intrinsics are in memory, depth is read on demand.
+
+    Attributes:
+        world_from_cam: (N, 4, 4) float64, OpenCV axes.
+        frame_index: (N,) int64 index of each pose within the processed stream.
+        camera: Shared camera: per-parameter median over the frames, at the resolution of the files.
+        intrinsics: (N, D) float64 as stored.
+        depth_kind: `ray` for panoramas, else `z`.
+        timestamps_s: (N,) float64, or None where no info file says.
+        info: Our description of the sequence; empty for directories of the original tool.
+    """
+
+    root: Path
+    name: str
+    world_from_cam: NDArray[np.float64]
+    frame_index: NDArray[np.int64]
+    camera: Camera
+    intrinsics: NDArray[np.float64]
+    depth_kind: DepthKind
+    timestamps_s: NDArray[np.float64] | None
+    info: dict[str, Any]
+
+    @property
+    def num_frames(self) -> int:
+        return len(self.world_from_cam)
+
+    @property
+    def has_depth(self) -> bool:
+        return artifact_path(self.root, self.name, "depth", "zip").is_file()
+
+    @property
+    def rgb_path(self) -> Path | None:
+        path = artifact_path(self.root, self.name, "rgb", "mp4")
+        return path if path.is_file() else None
+
+    def open_depth(self) -> DepthZipReader:
+        """Depth maps, one per pose; close it after use.
+
+        Raises:
+            FormatError: No depth, a damaged archive, or another number of maps than poses.
+        """
+        reader = DepthZipReader(artifact_path(self.root, self.name, "depth", "zip"))
+        if len(reader) != self.num_frames:
+            reader.close()
+            raise FormatError(f"{self.name}: {len(reader)} depth maps for {self.num_frames} poses")
+        return reader
+
+
+def read_artifacts(root: str | Path, name: str) -> Artifacts:
+    """Read the sequence `name` below `root`.
+
+    Raises:
+        FormatError: A file is missing or does not hold what it must; names the file.
+    """
+    root = Path(root)
+    poses, inds = _read_npz(artifact_path(root, name, "pose", "npz"))
+    if poses.ndim != 3 or poses.shape[1:] != (4, 4) or len(poses) == 0:
+        raise FormatError(f"pose/{name}.npz: `data` has shape {poses.shape}, (N, 4, 4) is needed")
+    if not np.isfinite(poses).all() or np.abs(poses[:, 3] - (0, 0, 0, 1)).max() > 1e-4:
+        raise FormatError(f"pose/{name}.npz: `data` holds matrices that are not rigid transforms")
+    intrinsics, intrinsics_inds = _read_npz(artifact_path(root, name, "intrinsics", "npz"))
+    if not np.array_equal(inds, intrinsics_inds):
+        raise FormatError(f"intrinsics/{name}.npz: its frames are not those of pose/{name}.npz")
+    info = _read_info(info_path(root, name), len(poses))
+    model, num_params = _read_model(artifact_path(root, name, "intrinsics", "camera.txt"), inds)
+    if intrinsics.ndim != 2 or intrinsics.shape[1] != num_params or not np.isfinite(intrinsics).all():
+        raise FormatError(f"intrinsics/{name}.npz: `data` has shape {intrinsics.shape}, (N, {num_params}) is needed")
+    width, height = _picture_size(root, name, info)
+    params = () if model == "equirect" else tuple(float(value) for value in np.median(intrinsics, axis=0))
+    try:
+        camera = Camera(model, params, width, height)
+    except ConfigError as error:
+        raise FormatError(f"intrinsics/{name}.npz: {error}") from error
+    stamps = info.get("timestamps_s")
+    return Artifacts(
+        root=root,
+        name=name,
+        world_from_cam=poses,
+        frame_index=inds,
+        camera=camera,
+        intrinsics=intrinsics,
+        depth_kind="ray" if model == "equirect" else "z",
+        timestamps_s=None if stamps is None else np.asarray(stamps, dtype=np.float64),
+        info=info,
+    )
+
+
+def _read_npz(path: Path) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    label = f"{path.parent.name}/{path.name}"
+    if not path.is_file():
+        raise FormatError(f"{label}: no such file; is the sequence name right?")
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            data, inds = file["data"], file["inds"]
+    except KeyError as error:
+        raise FormatError(f"{label}: `data` and `inds` are needed, {error.args[0]}") from error
+    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
+        raise FormatError(f"{label}: not a readable npz; write the artifact again") from error
+    if data.dtype.kind != "f" or inds.dtype.kind not in "iu" or inds.shape != data.shape[:1]:
+        raise FormatError(f"{label}: `data` must be real numbers with one integer in `inds` per row")
+    return data.astype(np.float64), inds.astype(np.int64)
+
+
+def _read_model(path: Path, inds: NDArray[np.int64]) -> tuple[CameraModel, int]:
+    """Model and number of parameters; without the file it is a pinhole, as in the published datasets."""
+    if not path.is_file():
+        return _MODELS["PINHOLE"]
+    label = f"{path.parent.name}/{path.name}"
+    try:
+        lines = [line.split(":") for line in path.read_text(encoding="utf-8").splitlines() if line.strip()]
+        kinds = {int(index): kind.strip() for index, kind in lines}
+    except (ValueError, UnicodeDecodeError) as error:
+        raise FormatError(f"{label}: lines must read like `0: PINHOLE`") from error
+    names = set(kinds.values())
+    if set(kinds) != set(inds.tolist()) or len(names) != 1 or not names <= set(_MODELS):
+        raise FormatError(f"{label}: one camera of {', '.join(_MODELS)} is needed for every frame, got {sorted(names)}")
+    return _MODELS[names.pop()]
+
+
+def _read_info(path: Path, num_frames: int) -> dict[str, Any]:
+    if not path.is_file():
+        return {}
+    try:
+        info: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise FormatError(f"{path.parent.name}/{path.name}: not readable JSON") from error
+    stamps = info.get("timestamps_s") if isinstance(info, dict) else None
+    if not isinstance(stamps, list) or len(stamps) != num_frames or info.get("num_frames") != num_frames:
+        raise FormatError(f"{path.parent.name}/{path.name}: does not describe the {num_frames} frames of the poses")
+    return info
+
+
+def _picture_size(root: Path, name: str, info: dict[str, Any]) -> tuple[int, int]:
+    """(width, height) from our info, else from the first depth map, else from the video."""
+    width, height = info.get("width"), info.get("height")
+    if isinstance(width, int) and isinstance(height, int) and width > 0 and height > 0:
+        return width, height
+    depth = artifact_path(root, name, "depth", "zip")
+    if depth.is_file():
+        with DepthZipReader(depth) as reader:
+            if len(reader):
+                rows, columns = reader.read(0).shape
+                return columns, rows
+    rgb = artifact_path(root, name, "rgb", "mp4")
+    if not rgb.is_file():
+        raise FormatError(f"{name}: neither depth/{name}.zip nor rgb/{name}.mp4 tells the size of the pictures")
+    try:
+        video = probe(rgb)
+    except VipeError as error:
+        raise FormatError(f"rgb/{name}.mp4: {error}") from error
+    return video.width, video.height
