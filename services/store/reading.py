@@ -228,7 +228,8 @@ def _expected_frames(job: Row[Any], leased: list[Row[Any]], settled: int) -> int
     known_frames: int = job.frames_committed + sum(s.frames_expected for s in probed)
     unknown_videos = max(job.videos_total - known_videos, 0)
     mean: float = known_frames / known_videos
-    return known_frames + round(mean * unknown_videos)
+    extra: int = round(mean * unknown_videos)
+    return known_frames + extra
 
 
 def _frames_per_s(tx: Tx, job: Row[Any], recent: list[Row[Any]]) -> float:
