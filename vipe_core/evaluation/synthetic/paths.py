@@ -14,7 +14,7 @@ from vipe_core.evaluation.synthetic.scene import Vec3
 
 
 def look_at(eye: NDArray[np.float64], target: NDArray[np.float64]) -> NDArray[np.float64]:
-    """world_from_cam (..., 4, 4) of upright cameras at `eye` (..., 3) that look at `target` (..., 3); the world is z up."""
+    """world_from_cam (..., 4, 4) of upright cameras at `eye` (..., 3) that look at `target` (..., 3), z up."""
     eye, target = np.broadcast_arrays(np.asarray(eye, np.float64), np.asarray(target, np.float64))
     forward = target - eye
     forward /= np.linalg.norm(forward, axis=-1, keepdims=True)
