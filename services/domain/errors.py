@@ -56,6 +56,13 @@ class OutputInUse(ServiceError):
     status = 409
 
 
+class OutputUnsupported(ServiceError):
+    """The output cannot decide which of two writers came first, so nothing could be committed exactly once."""
+
+    code = "output_unsupported"
+    status = 422
+
+
 class IdempotencyConflict(ServiceError):
     """The same `Idempotency-Key` came with another body."""
 

@@ -69,11 +69,14 @@ class VideoRef:
     etag: str | None = None
 
 
-def video_key(uri: str) -> str:
-    """Stable key of an input: its sanitised stem, then 8 hex of the address, so that equal stems never collide."""
+def video_key(uri: str, hex_digits: int = 8) -> str:
+    """Stable key of an input: its sanitised stem, then hex of its address, so that equal stems stay apart.
+
+    Among a million equal stems some pairs agree in 8 digits; the planner takes 16 for the second of such a pair.
+    """
     stem = uri.rstrip("/").rsplit("/", 1)[-1].rsplit(".", 1)[0]
     readable = re.sub(r"[^a-z0-9_-]+", "-", stem.lower()).strip("-")[:48] or "video"
-    return f"{readable}-{hashlib.sha256(uri.encode()).hexdigest()[:8]}"
+    return f"{readable}-{hashlib.sha256(uri.encode()).hexdigest()[:hex_digits]}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -235,7 +238,7 @@ class PayloadObject:
 
     Attributes:
         key: Object key relative to the output root, attempt-unique.
-        members: Sample key -> member name -> (offset, size) of the data in the tar, so that one video can be range-read.
+        members: Sample key -> member name -> (offset, size) of the data in the tar, so that one can be range-read.
     """
 
     attribute: Attribute
