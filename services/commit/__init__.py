@@ -1,0 +1,24 @@
+"""Shard tars and the commit protocol: exactly one whole result per shard, whatever crashes."""
+
+from __future__ import annotations
+
+from services.commit.gc import GcReport, collect_garbage
+from services.commit.layout import ATTRIBUTES, attributes_of, commit_key, payload_key
+from services.commit.protocol import CommitOutcome, PreparedPayload, commit_shard, prepare_payload, write_record
+from services.commit.reconcile import committed_record, committed_records
+
+__all__ = [
+    "ATTRIBUTES",
+    "CommitOutcome",
+    "GcReport",
+    "PreparedPayload",
+    "attributes_of",
+    "collect_garbage",
+    "commit_key",
+    "commit_shard",
+    "committed_record",
+    "committed_records",
+    "payload_key",
+    "prepare_payload",
+    "write_record",
+]
