@@ -154,8 +154,8 @@ def depth_errors(
     """Compares depth frame by frame with one scale for the sequence, the median of truth / estimate.
 
     Args:
-        pairs: (estimate, truth, use) per frame, each (h, w) and of the same kind of depth. Values <= 0 or not finite are
-            missing; `use` selects pixels, e.g. the static ones.
+        pairs: (estimate, truth, use) per frame, each (h, w) and of the same kind of depth. Values <= 0 or not finite
+            are missing; `use` selects pixels, e.g. the static ones.
 
     Returns:
         None without a single pixel that has both values.

@@ -271,5 +271,5 @@ def cast(
             sx, sy, sz = wx + 1e-4 * mx, wy + 1e-4 * my, wz + 1e-4 * mz
             if _occluded(sx, sy, sz, vx, vy, vz, reach, kind, centre, rotation, half, bound, dynamic):
                 lambert, shadowed = 0.0, 1
-        shade[ray] = corner * (light[4] * (0.85 + 0.15 * mz) + light[5] * lambert)
+        shade[ray] = corner * (light[4] * (0.95 + 0.05 * mz) + light[5] * lambert)
         surface[ray] = 16 * hit + 2 * face + shadowed

@@ -26,7 +26,7 @@ def room_scene() -> Scene:
     bricks = Material("bricks", ((0.70, 0.36, 0.26), (0.52, 0.25, 0.19), (0.78, 0.73, 0.66)), 0.26, 0.32, 0.12, 2)
     teal = _plain((0.36, 0.56, 0.60), 0.18, 0.16, 3)
     cream = _plain((0.90, 0.84, 0.72), 0.16, 0.16, 4)
-    ceiling = Material("tiles", (_WHITE, (0.89, 0.87, 0.83), (0.66, 0.64, 0.61)), 0.75, 0.16, 0.2, 5)
+    ceiling = Material("tiles", (_WHITE, (0.89, 0.87, 0.83), (0.66, 0.64, 0.61)), 0.75, 0.09, 0.2, 5)
     floor = Material("planks", ((0.66, 0.47, 0.30), (0.46, 0.30, 0.18), (0.16, 0.10, 0.06)), 0.16, 0.22, 0.3, 6)
     solids: list[Primitive] = [room((0.0, 0.0, 0.0), (6.0, 5.0, 2.7), teal, bricks, cream, paper, floor, ceiling)]
     solids += _bookcase() + _table() + _sofa()
@@ -144,8 +144,8 @@ def moving_ball_scene() -> Scene:
     parcel = Material("tiles", ((0.78, 0.62, 0.42), (0.70, 0.54, 0.35), (0.32, 0.20, 0.12)), 0.16, 0.3, 0.08, 52)
     return room_scene().with_primitives(
         sphere(
-            (3.35, 1.75, 1.02),
-            0.42,
+            (3.30, 1.75, 1.02),
+            0.31,
             ball,
             18.0,
             Motion(swing=(1.05, 0.25, 0.0), period_s=4.2, phase=0.55, spin_rad_s=-2.4),
@@ -195,7 +195,7 @@ def courtyard_scene() -> Scene:
         box(
             (0.0, 27.95, 1.5),
             (2.4, 0.3, 3.0),
-            Material("planks", ((0.30, 0.36, 0.30), (0.22, 0.28, 0.24), _DARK), 0.2, 0.25, 0.2, 81),
+            Material("planks", ((0.50, 0.32, 0.20), (0.36, 0.22, 0.14), _DARK), 0.3, 0.25, 0.2, 81),
         ),
     ]
     leaves = Material("foliage", ((0.09, 0.18, 0.07), (0.26, 0.44, 0.14), (0.62, 0.70, 0.28)), 0.55, 0.4, 0.2, 82)
