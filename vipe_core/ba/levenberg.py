@@ -21,6 +21,8 @@ _MAX_DAMPING = 1e8
 _MIN_DAMPING = 1e-10
 _ACCEPTED_FACTOR = 0.2
 _REJECTED_FACTOR = 10.0
+# Mean squared residual, px^2, at which exact data is solved and only rounding is left.
+_NEGLIGIBLE_COST = 1e-14
 
 
 def solve(problem: Problem, state: State, options: Options | None = None) -> Result:
@@ -69,11 +71,13 @@ def solve(problem: Problem, state: State, options: Options | None = None) -> Res
         new_state = solver.retract(state, step)
         new_cost = solver.cost(new_state)
         new_total = new_cost.total(lost_rho)
-        old, new, predicted, factorised = _read(total, new_total, step.predicted_drop, step.factorised)
+        old, new, predicted, factorised, mean = _read(
+            total, new_total, step.predicted_drop, step.factorised, new_total / new_cost.weight
+        )
         if factorised and new < old:
             state, cost, total = new_state, new_cost, new_total
             damping = max(damping * _ACCEPTED_FACTOR, _MIN_DAMPING)
-            if old - new < options.relative_tolerance * old:
+            if old - new < options.relative_tolerance * old or mean < _NEGLIGIBLE_COST:
                 status = Status.CONVERGED
                 break
             if iterations < options.max_iterations:
