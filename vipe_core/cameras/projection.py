@@ -28,6 +28,8 @@ from vipe_core.cameras.camera import CameraModel
 
 # The squared root g of the unified model at which a pixel of a camera with alpha > 1 is taken to be off its image disk.
 _MIN_DISK = 1e-6
+# Directions this close to the plane (or cone) that has no image are not imaged: keeps pixels finite.
+_MIN_SLOPE = 1e-9
 
 
 def num_free_intrinsics(model: CameraModel) -> int:
@@ -99,12 +101,13 @@ def depth_factor(model: CameraModel, params: Tensor, points: Tensor) -> tuple[Te
         s (...), and bool (...).
     """
     z = points[..., 2]
+    least = _MIN_SLOPE * points.abs().amax(dim=-1)
     if model == "pinhole":
-        return z, z > 0
+        return z, z > least
     alpha = params[4]
     norm = points.norm(dim=-1)
     s = z + alpha * norm
-    return s, (s > 0) & ((alpha <= 1) | (alpha * z > -norm))
+    return s, (s > least) & ((alpha <= 1) | (alpha * z > -norm))
 
 
 def project(model: CameraModel, params: Tensor, points: Tensor) -> tuple[Tensor, Tensor]:
