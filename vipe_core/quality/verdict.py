@@ -62,7 +62,7 @@ def assess(result: SlamResult, settings: SlamSettings, source_width: int) -> Qua
             fatal = fatal or found.inlier_ratio < _VERY_LOW_INLIERS
         if float((result.frame_inlier_ratio < _POSED_INLIERS).mean()) > _MAX_INTERPOLATED:
             reasons.append("interpolated_frames")
-    if not result.focal.observed or result.focal.sigma_ratio > settings.focal_doubt_sigma:
+    if result.focal.sigma_ratio > settings.focal_doubt_sigma:
         reasons.append("focal_unobservable")
     reliable: Reliability = "no" if fatal else "doubtful" if reasons else "yes"
     return Quality(

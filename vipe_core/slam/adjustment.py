@@ -118,7 +118,9 @@ class Adjuster:
                 inverse_depth=prior if free_depth else None,
                 inverse_depth_weight=prior_weight if free_depth else None,
                 log_focal=self.focal_prior.log_focal if free_focal else None,
-                log_focal_sigma=self.focal_prior.sigma,
+                # Formal sigmas of dense measurements are too small because their errors are correlated. Dividing the
+                # prior's by the same factor weighs the two against each other as they really are.
+                log_focal_sigma=self.focal_prior.sigma / self.settings.focal_sigma_inflation,
             ),
         )
         state = self._state(poses, depths, keyframes.intrinsics)

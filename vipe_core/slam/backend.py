@@ -16,13 +16,15 @@ from vipe_core.slam.masks import moving_cells
 from vipe_core.slam.proximity import close_pairs, loop_edges
 from vipe_core.slam.reprojection import Reprojector
 from vipe_core.slam.settings import SlamSettings
-from vipe_core.slam.tracking import MeasuredGraph
+from vipe_core.slam.measuring import MeasuredGraph
 
 logger = logging.getLogger(__name__)
 
 Array = NDArray[Any]
 
 _FOV_RANGE_DEG = (12.0, 150.0)
+# The adjustment has learnt something when it is this much surer than its prior.
+_OBSERVED_RATIO = 0.7
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,21 +89,22 @@ class Backend:
             )
 
     def _adjust(self) -> Result | None:
-        """Adjust with a free focal length; take the result back and hold it when the data does not determine it."""
+        """Adjust with a free focal length under its prior; take it back when it runs out of any lens's range."""
         frames = range(len(self._keyframes))
         before = self._keyframes.snapshot()
         result = self._adjuster.adjust(
             self._keyframes, self._measured.graph, frames, (0,), REFINE, free_focal=True
         )
-        sigma = math.inf
-        if result is not None and math.isfinite(result.log_focal_sigma):
-            sigma = self._settings.focal_sigma_inflation * result.log_focal_sigma
+        if result is None:
+            return None
+        prior_sigma = self._adjuster.focal_prior.sigma
+        sigma = self._settings.focal_sigma_inflation * result.log_focal_sigma
         fov_deg = math.degrees(2 * math.atan(self._width / 2 / float(self._keyframes.intrinsics[0])))
-        if sigma <= self._settings.focal_hold_sigma and _FOV_RANGE_DEG[0] < fov_deg < _FOV_RANGE_DEG[1]:
-            self.focal = FocalReport(sigma, observed=True)
+        if math.isfinite(sigma) and _FOV_RANGE_DEG[0] < fov_deg < _FOV_RANGE_DEG[1]:
+            self.focal = FocalReport(sigma, observed=sigma < _OBSERVED_RATIO * prior_sigma)
             return result
-        logger.info("focal length held: inflated sigma %.3f, field of view %.1f deg", sigma, fov_deg)
-        self.focal = FocalReport(self._adjuster.focal_prior.sigma, observed=False)
+        logger.info("focal length held: it went to a field of view of %.1f deg, sigma %.3f", fov_deg, sigma)
+        self.focal = FocalReport(prior_sigma, observed=False)
         self._keyframes.restore(before)
         return self._adjuster.adjust(self._keyframes, self._measured.graph, frames, (0,), REFINE)
 

@@ -29,7 +29,6 @@ class SlamSettings:
         proximity_overlap: Least share of cells seen by both ends of a proximity edge.
         min_consistent: Least forward-backward consistency of a proximity edge.
         focal_sigma_inflation: Factor on the solver's formal 1-sigma of log focal that makes it match real errors.
-        focal_hold_sigma: An inflated sigma above this holds the focal length at its initial value.
         focal_doubt_sigma: An inflated sigma above this makes the result doubtful.
         infill_batch: Frames posed in one motion-only adjustment.
     """
@@ -49,8 +48,7 @@ class SlamSettings:
     proximity_px: float = 80.0
     proximity_overlap: float = 0.6
     min_consistent: float = 0.4
-    focal_sigma_inflation: float = 30.0
-    focal_hold_sigma: float = 0.3
+    focal_sigma_inflation: float = 6.0
     focal_doubt_sigma: float = 0.05
     infill_batch: int = 16
 

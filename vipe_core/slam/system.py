@@ -20,14 +20,16 @@ from vipe_core.geometry.arrays import inverse
 from vipe_core.priors.protocols import IntrinsicsEstimate, PriorFamily
 from vipe_core.slam.adjustment import Adjuster, FocalPrior
 from vipe_core.slam.backend import Backend, FocalReport
+from vipe_core.slam.bootstrap import Bootstrap
 from vipe_core.slam.diagnostics import MapReport, examine
 from vipe_core.slam.graph import Graph
 from vipe_core.slam.infill import Infill
 from vipe_core.slam.keyframes import KeyframeMap
+from vipe_core.slam.measuring import MeasuredGraph
 from vipe_core.slam.reprojection import Reprojector
 from vipe_core.slam.selection import Report, Selection, select_keyframes
 from vipe_core.slam.settings import SlamSettings
-from vipe_core.slam.tracking import MeasuredGraph, Tracker
+from vipe_core.slam.tracking import Tracker
 from vipe_core.slam.working import WorkingSize, working_size
 from vipe_core.video.source import FrameSource
 
@@ -110,8 +112,14 @@ class Slam:
             measured, adjuster, reprojector, self._settings, self._settings.scaled_px(1.0, size.width)
         )
         with _timed(timings, "track"):
+            times_s = [float(selection.timestamps_s[keyframe.index]) for keyframe in chosen]
+            first = min(len(chosen), self._settings.min_keyframes)
+            Bootstrap(measured, adjuster, reprojector, self._settings.neighbours).run(chosen[:first], times_s[:first])
             for done, keyframe in enumerate(chosen, start=1):
-                tracker.add(keyframe, float(selection.timestamps_s[keyframe.index]))
+                if done > first:
+                    tracker.add(keyframe, times_s[done - 1])
+                if done < first:
+                    continue
                 if done in self._settings.backend_at and done < len(chosen):
                     backend.run()
                 report("track", keyframe.index + 1, selection.num_frames)

@@ -1,0 +1,51 @@
+"""Matching pairs of keyframes, dense and sparse, into the graph."""
+
+from __future__ import annotations
+
+from vipe_core.priors.protocols import DenseMatcher, SparseTracker
+from vipe_core.slam.graph import Graph, fuse
+from vipe_core.slam.keyframes import KeyframeMap
+from vipe_core.slam.reprojection import Reprojector
+
+
+class MeasuredGraph:
+    """Matches pairs of keyframes, dense and sparse, and files both directions in the graph."""
+
+    def __init__(
+        self,
+        keyframes: KeyframeMap,
+        graph: Graph,
+        matcher: DenseMatcher,
+        sparse: SparseTracker | None,
+        reprojector: Reprojector,
+    ) -> None:
+        self.keyframes = keyframes
+        self.graph = graph
+        self._matcher = matcher
+        self._sparse = sparse
+        self._reprojector = reprojector
+
+    def connect(self, i: int, j: int, *, guided: bool, min_consistent: float = 0.0) -> float:
+        """Measure i -> j and j -> i.
+
+        Args:
+            guided: Start the search where the current poses and depths of the map put it.
+            min_consistent: A match with less forward-backward consistency is not filed.
+
+        Returns:
+            The smaller consistency of the two directions.
+        """
+        source, target = self.keyframes.features[i], self.keyframes.features[j]
+        guess_px = None
+        if guided:
+            guess_px = self._reprojector.edge(self.keyframes, i, j).target_px
+        there, back = self._matcher.match(source, target, guess_px)
+        consistent = min(there.consistent, back.consistent)
+        if consistent < min_consistent:
+            return consistent
+        if self._sparse is not None:
+            there = fuse(there, self._sparse.match(source, target, there))
+            back = fuse(back, self._sparse.match(target, source, back))
+        self.graph.add(i, j, there)
+        self.graph.add(j, i, back)
+        return consistent
