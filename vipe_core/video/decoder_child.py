@@ -45,6 +45,9 @@ class _Link:
         self._last_s = time.monotonic()
         signal.alarm(self._alarm_s)
 
+    def started(self) -> None:
+        self._send(Header(HEARTBEAT, 0), b"")
+
     def progress(self) -> None:
         if time.monotonic() - self._last_s > _HEARTBEAT_S:
             self._send(Header(HEARTBEAT, 0), b"")
@@ -112,6 +115,7 @@ def main() -> None:
     threading.Thread(target=_exit_with_parent, daemon=True).start()
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     resource.setrlimit(resource.RLIMIT_FSIZE, (_MAX_WRITTEN_FILE_BYTES, _MAX_WRITTEN_FILE_BYTES))
+    link.started()
     task = _probe if request.task == "probe" else _decode_images if request.images else _decode_video
     try:
         task(request, link)

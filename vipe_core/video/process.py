@@ -32,6 +32,8 @@ from vipe_core.video.wire import (
 
 _PACKAGE_ROOT = Path(__file__).resolve().parents[2]
 _PIPE_BYTES = 1 << 20
+# A busy machine takes its time to start an interpreter; that says nothing about the video.
+_START_S = 60.0
 
 
 class DecoderProcess:
@@ -47,6 +49,7 @@ class DecoderProcess:
     def __init__(self, request: Request, label: str, stall_s: float, wall_s: float | None = None) -> None:
         self._label = label
         self._stall_s = stall_s
+        self._wait_s = max(stall_s, _START_S)
         self._deadline_s = None if wall_s is None else time.monotonic() + wall_s
         with contextlib.ExitStack() as resources:
             self._errors: IO[bytes] = resources.enter_context(tempfile.TemporaryFile())
@@ -132,6 +135,7 @@ class DecoderProcess:
     def _header(self) -> Header:
         raw = bytearray(HEADER_BYTES)
         self._fill(memoryview(raw))
+        self._wait_s = self._stall_s
         return Header.unpack(raw)
 
     def _read_document(self, header: Header) -> dict[str, Any]:
@@ -155,7 +159,7 @@ class DecoderProcess:
             view = view[count:]
 
     def _wait(self) -> None:
-        timeout_s = self._stall_s
+        timeout_s = self._wait_s
         if self._deadline_s is not None:
             timeout_s = min(timeout_s, self._deadline_s - time.monotonic())
         if timeout_s <= 0 or not self._selector.select(timeout_s):
