@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import zipfile
+import zlib
 from collections.abc import Iterator
 from pathlib import Path
 from types import TracebackType
@@ -119,7 +120,7 @@ class DepthZipReader:
             raise FormatError(f"{label}: {member.file_size} bytes are no depth map")
         try:
             data = self._zip.read(member)
-        except (zipfile.BadZipFile, OSError, EOFError, ValueError, NotImplementedError, RuntimeError) as error:
+        except (zipfile.BadZipFile, zlib.error, OSError, EOFError, ValueError, RuntimeError) as error:
             raise FormatError(f"{label}: the member is damaged; write the artifact again") from error
         return decode_depth(data, label)
 

@@ -29,7 +29,8 @@ def encode_depth(depth: NDArray[np.floating]) -> bytes:
     if depth.ndim != 2 or depth.size == 0:
         raise ValueError(f"a depth map has two dimensions, got {depth.shape}")
     valid = np.isfinite(depth) & (depth > 0)
-    half = np.where(valid, np.clip(depth, _MIN_DEPTH, MAX_DEPTH), 0).astype(np.float16)
+    # The library takes the buffer for row-major whatever its strides say.
+    half = np.ascontiguousarray(np.where(valid, np.clip(depth, _MIN_DEPTH, MAX_DEPTH), 0), dtype=np.float16)
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
     # The library's Python interface only knows file names.
     with tempfile.TemporaryDirectory(prefix="exr-") as folder:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import zipfile
+import zlib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -123,7 +124,7 @@ def _read_npz(path: Path) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
             data, inds = file["data"], file["inds"]
     except KeyError as error:
         raise FormatError(f"{label}: `data` and `inds` are needed, {error.args[0]}") from error
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
+    except (OSError, ValueError, EOFError, zlib.error, zipfile.BadZipFile) as error:
         raise FormatError(f"{label}: not a readable npz; write the artifact again") from error
     if data.dtype.kind != "f" or inds.dtype.kind not in "iu" or inds.shape != data.shape[:1]:
         raise FormatError(f"{label}: `data` must be real numbers with one integer in `inds` per row")
