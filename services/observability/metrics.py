@@ -86,8 +86,8 @@ class Metrics:
         )
         self.commit_conflicts = Counter(
             "vipe_commit_conflicts_total",
-            "Commits that found something in their way: `lost` to another attempt, `fenced` before the commit point, "
-            "`foreign` record of another plan.",
+            "Commits that found something in their way: `adopted` the record of a faster attempt, `lost_lease` "
+            "before the commit point, `conflict` with a record of another plan.",
             ["result"],
             registry=registry,
         )
@@ -95,7 +95,7 @@ class Metrics:
         # Actors.
         self.actor_restarts = Counter(
             "vipe_actor_restarts_total",
-            "Worker processes replaced, by reason: died, video_timeout, unresponsive, start_failed.",
+            "Worker processes that had to be replaced, by reason: died, video_timeout, start_failed.",
             ["reason"],
             registry=registry,
         )
@@ -112,7 +112,7 @@ class Metrics:
         )
         self.object_store_requests = Counter(
             "vipe_object_store_requests_total",
-            "Operations on object storage by outcome: ok, missing, exists, error.",
+            "Requests to object storage by HTTP status, `error` where no answer came.",
             ["op", "status"],
             registry=registry,
         )

@@ -1,0 +1,89 @@
+"""From uploaded tars to a shard that exists, and back from a record in the output to a database that missed it."""
+
+from __future__ import annotations
+
+import logging
+import threading
+
+from services.agent.traffic import TrafficMetrics
+from services.commit.protocol import CommitOutcome, PreparedPayload, write_record
+from services.commit.reconcile import committed_record, committed_records
+from services.domain.errors import CommitConflict
+from services.domain.models import CommitRecord, Job, Lease
+from services.observability.metrics import Metrics
+from services.storage import ObjectStore, open_store
+from services.store.base import Store
+
+logger = logging.getLogger(__name__)
+
+_MAX_OPEN_OUTPUTS = 64
+
+
+class Committer:
+    """The agent's side of the commit protocol. Thread-safe."""
+
+    def __init__(self, store: Store, metrics: Metrics, s3_endpoint_url: str | None = None) -> None:
+        self._store = store
+        self._metrics = metrics
+        self._traffic = TrafficMetrics(metrics)
+        self._s3_endpoint_url = s3_endpoint_url
+        self._lock = threading.Lock()
+        self._outputs: dict[str, ObjectStore] = {}
+
+    def output(self, uri: str) -> ObjectStore:
+        """The output location; one client per location, kept."""
+        with self._lock:
+            store = self._outputs.pop(uri, None)
+            if store is None:
+                store = open_store(uri, endpoint_url=self._s3_endpoint_url, observer=self._traffic)
+            self._outputs[uri] = store
+            while len(self._outputs) > _MAX_OPEN_OUTPUTS:
+                del self._outputs[next(iter(self._outputs))]
+            return store
+
+    def write(self, lease: Lease, payload: PreparedPayload) -> CommitOutcome:
+        """The commit point. Idempotent; see `services.commit.protocol.write_record` for what it raises."""
+        output = self.output(lease.spec.output)
+        try:
+            outcome = write_record(output, payload, lambda: self._store.holds(lease.shard_id, lease.fence))
+        except CommitConflict:
+            self._metrics.commit_conflicts.labels(result="conflict").inc()
+            raise
+        if outcome.kind != "committed":
+            self._metrics.commit_conflicts.labels(result=outcome.kind).inc()
+            logger.warning("commit of %s: %s", lease.shard_id, outcome.kind)
+        return outcome
+
+    def record(self, record: CommitRecord) -> bool:
+        """Tell the database what the output says, and count it if the database did not know."""
+        new = self._store.record_commit(record)
+        if new:
+            for video in record.videos:
+                self._metrics.observe_video(video)
+            logger.info("committed %s: %d videos, %d frames", record.shard_id, len(record.videos), record.frames)
+        return new
+
+    def settled(self, lease: Lease) -> bool:
+        """Whether an earlier attempt committed this shard without living to say so; if so the database learns it.
+
+        Raises:
+            CommitConflict: The record belongs to another plan.
+        """
+        found = committed_record(self.output(lease.spec.output), lease.job_id, lease.shard_id)
+        if found is None:
+            return False
+        self.record(found)
+        return True
+
+    def reconcile(self, job: Job) -> int:
+        """Compare a job's open shards with the records in its output; returns how many the database had missed."""
+        open_shards = {shard.id for shard in self._store.uncommitted_shards(job.id)}
+        if not open_shards:
+            return 0
+        missed = 0
+        for record in committed_records(self.output(job.spec.output), job.id):
+            if record.shard_id in open_shards and self.record(record):
+                missed += 1
+        if missed:
+            logger.info("found %d committed shards of %s that the database had missed", missed, job.id)
+        return missed

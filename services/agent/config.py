@@ -1,0 +1,107 @@
+"""What an agent must know. Values only; `services.settings` decides where they come from."""
+
+from __future__ import annotations
+
+import os
+import socket
+import uuid
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+if TYPE_CHECKING:
+    from services.settings import Settings
+
+DEFAULT_ENGINE = "services.agent.engine:open_engine"
+
+
+def new_holder() -> str:
+    """A holder name that no other agent process ever has: host, process and a random part."""
+    return f"{socket.gethostname()}-{os.getpid()}-{uuid.uuid4().hex[:8]}"
+
+
+@dataclass(frozen=True, slots=True)
+class AgentConfig:
+    """Settings of one agent.
+
+    Attributes:
+        scratch_dir: Node-local folder for inputs, artifacts and tars in the making. On a cluster: the same path on
+            every node, each with its own contents.
+        slots: Worker processes; one video in each.
+        device: Where the engine runs.
+        gpus_per_slot: Share of a GPU that a slot reserves when `device` is `cuda`.
+        cpus_per_slot: Cores that a slot reserves, and the threads its numeric libraries may use.
+        ray_address: None starts a private Ray on this machine; otherwise the address of a cluster to join.
+        lease_ttl_s: A lease that is not renewed for so long is given to somebody else; renewed every third of it.
+        poll_s: Pause between two looks for work when there is none.
+        video_budget_base_s: Wall budget of one video: this, plus the next two terms.
+        video_budget_per_frame_s: Seconds per frame of the video.
+        fetch_min_bytes_per_s: Slowest download that is still waited for.
+        pack_budget_s: Wall budget for building, verifying and uploading the tars of one shard.
+        start_timeout_s: A worker process that is not ready by then counts as failed.
+        cancel_grace_s: How long a worker may take to stop by itself before it is killed.
+        max_worker_deaths: A video that killed its worker so often is quarantined.
+        max_video_tries: Attempts within one lease at a video whose error says that another attempt can succeed.
+        max_slot_deaths: Deaths in a row on distinct videos after which a slot is fenced.
+        storage_tries: Attempts at one storage operation before the lease is given back.
+        max_give_backs: How often this agent gives one shard back. After that an input that still cannot be fetched
+            becomes an error row, and a shard that still cannot be packed fails its job.
+        fence_cooloff_s: How long a fenced slot rests before it gets another chance.
+        backoff_base_s, backoff_max_s: Full-jitter exponential backoff after a failure of storage or the store.
+        scratch_max_age_s: Leftovers of shards that nobody came back for are removed after this.
+        engine: `module:callable` that opens an engine from (preset, camera, device).
+        input_roots: Where local inputs must lie; empty: anywhere.
+        s3_endpoint_url: S3 service other than AWS.
+    """
+
+    scratch_dir: Path
+    slots: int = 1
+    device: Literal["cpu", "cuda"] = "cpu"
+    gpus_per_slot: float = 1.0
+    cpus_per_slot: int = 1
+    ray_address: str | None = None
+    lease_ttl_s: float = 60.0
+    poll_s: float = 1.0
+    video_budget_base_s: float = 300.0
+    video_budget_per_frame_s: float = 5.0
+    fetch_min_bytes_per_s: float = 1e6
+    pack_budget_s: float = 3600.0
+    start_timeout_s: float = 120.0
+    cancel_grace_s: float = 5.0
+    max_worker_deaths: int = 3
+    max_video_tries: int = 2
+    max_slot_deaths: int = 3
+    storage_tries: int = 4
+    max_give_backs: int = 6
+    fence_cooloff_s: float = 300.0
+    backoff_base_s: float = 1.0
+    backoff_max_s: float = 60.0
+    scratch_max_age_s: float = 86400.0
+    engine: str = DEFAULT_ENGINE
+    input_roots: tuple[Path, ...] = ()
+    s3_endpoint_url: str | None = None
+    holder: str = field(default_factory=new_holder)
+
+    def __post_init__(self) -> None:
+        if self.slots < 1:
+            raise ValueError(f"slots must be at least 1, got {self.slots}")
+        if self.lease_ttl_s <= 0:
+            raise ValueError(f"lease_ttl_s must be positive, got {self.lease_ttl_s}")
+        if not self.scratch_dir.is_absolute():
+            raise ValueError(f"scratch_dir must be an absolute path, got {self.scratch_dir}")
+
+
+def config_from_settings(settings: Settings) -> AgentConfig:
+    """What the service's settings say about its agent."""
+    return AgentConfig(
+        scratch_dir=settings.scratch_dir,
+        slots=settings.num_slots,
+        device=settings.device,
+        ray_address=settings.ray_address,
+        lease_ttl_s=settings.lease_ttl_s,
+        video_budget_base_s=settings.video_timeout_base_s,
+        video_budget_per_frame_s=settings.video_timeout_per_frame_s,
+        max_worker_deaths=settings.max_worker_deaths,
+        input_roots=settings.input_roots,
+        s3_endpoint_url=settings.s3_endpoint_url,
+    )

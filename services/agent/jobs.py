@@ -1,0 +1,128 @@
+"""What happens to jobs rather than to shards: planning, reconciling with the output, finalising."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable
+
+from services.agent.backoff import Backoff
+from services.agent.commits import Committer
+from services.agent.config import AgentConfig
+from services.dataset import finalise
+from services.domain.errors import ServiceError
+from services.domain.models import Job
+from services.domain.states import JobState
+from services.observability.logging import context
+from services.observability.metrics import Metrics
+from services.planner import plan_next
+from services.store.base import Store
+
+logger = logging.getLogger(__name__)
+
+_FINALISE_TRIES = 8
+
+
+class JobKeeper:
+    """Moves jobs along. One step at a time, from one thread; an error in one job is that job's alone."""
+
+    def __init__(
+        self,
+        store: Store,
+        committer: Committer,
+        config: AgentConfig,
+        metrics: Metrics,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._store = store
+        self._committer = committer
+        self._config = config
+        self._metrics = metrics
+        self._clock = clock
+        self._planning = self._backoff()
+        self._plan_after_s = 0.0
+        self._finalising: dict[str, Backoff] = {}
+        self._finalise_after_s = 0.0
+
+    def step(self) -> bool:
+        """Plan a job and finalise a job, where there is one; whether anything was done. Never raises."""
+        planned = self._plan()
+        finalised = self._finalise()
+        return planned or finalised
+
+    def reconcile(self) -> None:
+        """Let the database learn what running jobs have in their output that it missed. Never raises."""
+        after: str | None = None
+        while True:
+            try:
+                jobs, after = self._store.list_jobs(state=JobState.RUNNING, after=after)
+            except Exception as error:
+                logger.warning("could not list the running jobs to reconcile: %s", error)
+                return
+            for job in jobs:
+                try:
+                    self._committer.reconcile(job)
+                except Exception as error:  # A retaken lease looks for its own record again.
+                    logger.warning("could not reconcile %s: %s", job.id, error)
+            if after is None:
+                return
+
+    def _plan(self) -> bool:
+        if self._clock() < self._plan_after_s:
+            return False
+        try:
+            busy = plan_next(
+                self._store, input_roots=self._config.input_roots, s3_endpoint_url=self._config.s3_endpoint_url
+            )
+        except Exception as error:
+            delay_s = self._planning.failed()
+            self._plan_after_s = self._clock() + delay_s
+            trace = not isinstance(error, ServiceError)
+            logger.warning("planning failed, next try in %.1f s: %s", delay_s, error, exc_info=trace)
+            return False
+        self._planning.succeeded()
+        return busy
+
+    def _finalise(self) -> bool:
+        if self._clock() < self._finalise_after_s:
+            return False
+        try:
+            job = self._store.next_finalizable()
+        except Exception as error:
+            logger.warning("could not look for jobs to finalise: %s", error)
+            return False
+        if job is None:
+            return False
+        with context(job=job.id):
+            self._finalise_job(job)
+        return True
+
+    def _finalise_job(self, job: Job) -> None:
+        backoff = self._finalising.setdefault(job.id, self._backoff())
+        started = self._clock()
+        try:
+            finalise(job, self._committer.output(job.spec.output))
+            done = self._store.finish_job(job.id)
+        except Exception as error:
+            typed = isinstance(error, ServiceError)
+            delay_s = backoff.failed()
+            if backoff.failures < _FINALISE_TRIES and (not isinstance(error, ServiceError) or error.retryable):
+                self._finalise_after_s = self._clock() + delay_s
+                logger.warning("could not finalise, next try in %.1f s: %s", delay_s, error, exc_info=not typed)
+                return
+            logger.error("cannot be finalised: %s", error, exc_info=not typed)
+            self._fail(job, error)
+        else:
+            self._metrics.stage_duration.labels(stage="finalise").observe(self._clock() - started)
+            logger.info("%s: %s", job.id, done.state.value)
+        self._finalising.pop(job.id, None)
+
+    def _fail(self, job: Job, error: Exception) -> None:
+        code = error.code if isinstance(error, ServiceError) else "internal_error"
+        try:
+            self._store.fail_job(job.id, code, str(error).splitlines()[0] if str(error) else type(error).__name__)
+        except Exception as second:
+            logger.warning("could not mark the job as failed: %s", second)
+
+    def _backoff(self) -> Backoff:
+        return Backoff(self._config.backoff_base_s, self._config.backoff_max_s)

@@ -1,0 +1,301 @@
+"""Worker slots as Ray actors: on a private Ray of this machine, or on a cluster.
+
+Ray only starts, reaches and kills processes. It restarts nothing (`max_restarts=0`, `max_task_retries=0`): a silent
+retry would run a video that kills its worker again without telling whom to blame.
+
+A private Ray is bound to this process by the kernel (`PR_SET_PDEATHSIG`): when the process dies, even by SIGKILL, its
+raylet and workers die within seconds. The kernel ties this to the *thread* that started them, so `RayExecutor.start`
+must be called from a thread that lives as long as the executor.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import math
+import os
+import secrets
+import shutil
+import signal
+import tempfile
+import threading
+import time
+from pathlib import Path
+from typing import Any
+
+from services.agent.config import AgentConfig
+from services.agent.executor import Died, SlotHandle
+from services.agent.messages import Failed, Reply, SlotProgress, Task
+from services.agent.slot import Slot, SlotConfig
+from services.observability.logging import configure_logging
+from vipe_core.errors import EngineError
+
+logger = logging.getLogger(__name__)
+
+_OBJECT_STORE_BYTES = 100 << 20  # Results are a few kilobytes; frames never travel through Ray.
+_SESSION_PATH_CHARS = 66  # "/session_<date>_<time>_<pid>/sockets/plasma_store" and what Ray appends
+_MAX_SOCKET_PATH = 107
+_PROGRESS_INTERVAL_S = 0.5
+_NAMESPACE = "vipe"
+_THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
+
+# Read by Ray when it starts. A private Ray reports to nobody, and its helpers outlive its head by seconds only.
+_PRIVATE_ENVIRONMENT = {
+    "RAY_USAGE_STATS_ENABLED": "0",
+    "RAY_gcs_rpc_server_reconnect_timeout_s": "10",
+    "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0",
+}
+
+
+class SlotActor:
+    """The actor: a `Slot`, with `progress` and `cancel` answered beside the running task."""
+
+    def __init__(self, config: SlotConfig, log_level: str) -> None:
+        configure_logging(log_level, "text")
+        self._slot = Slot(config)
+
+    def identity(self) -> tuple[str, int]:
+        """(Ray node id, process id)."""
+        import ray
+
+        return ray.get_runtime_context().get_node_id(), os.getpid()
+
+    def run(self, task: Task) -> Reply:
+        return self._slot.run(task)
+
+    def progress(self) -> SlotProgress:
+        return self._slot.progress()
+
+    def cancel(self) -> None:
+        self._slot.cancel()
+
+
+class RaySlot:
+    """A `SlotHandle` on a Ray actor."""
+
+    def __init__(self, actor_class: Any, config: AgentConfig, *, private: bool) -> None:
+        self._actor_class = actor_class
+        self._config = config
+        self._private = private
+        self._actor: Any = None
+        self._pid: int | None = None
+        self._node_id: str | None = None
+        self._task: Any = None
+        self._lock = threading.Lock()
+        self._progress = SlotProgress()
+        self._progress_call: Any = None
+        self._progress_asked_s = 0.0
+
+    @property
+    def pid(self) -> int | None:
+        """The worker's process id on its node; None while there is no process."""
+        return self._pid
+
+    def start(self, timeout_s: float) -> Died | None:
+        import ray
+        from ray.exceptions import RayError
+        from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
+
+        config = self._config
+        options: dict[str, Any] = {}
+        if self._node_id is not None and not self._private:
+            # Finished artifacts lie on the node of the last process.
+            options["scheduling_strategy"] = NodeAffinitySchedulingStrategy(self._node_id, soft=True)
+        slot_config = SlotConfig(
+            config.scratch_dir, config.device, config.engine, config.s3_endpoint_url, config.scratch_max_age_s
+        )
+        level = logging.getLevelName(logging.getLogger().getEffectiveLevel())
+        try:
+            self._actor = self._actor_class.options(**options).remote(slot_config, level)
+            self._node_id, self._pid = ray.get(self._actor.identity.remote(), timeout=timeout_s)
+        except RayError as error:
+            return _died(error)
+        with self._lock:
+            self._progress, self._progress_call = SlotProgress(), None
+        return None
+
+    def submit(self, task: Task) -> None:
+        if self._actor is None or self._task is not None:
+            raise RuntimeError("a slot takes one task at a time, and only while its process lives")
+        self._task = self._actor.run.remote(task)
+
+    def poll(self, timeout_s: float) -> Reply | Died | None:
+        import ray
+        from ray.exceptions import RayError, RayTaskError
+
+        try:
+            ready, _ = ray.wait([self._task], timeout=timeout_s)
+            if not ready:
+                return None
+            reply: Reply = ray.get(ready[0])
+        except RayTaskError as error:
+            self._task = None
+            first = str(error.cause or error).splitlines()[0]
+            return Reply(Failed(EngineError.code, f"a worker's reply was lost: {first}", False, "shard", str(error)))
+        except RayError as error:
+            self._task = None
+            return _died(error)
+        self._task = None
+        return reply
+
+    def progress(self) -> SlotProgress:
+        import ray
+        from ray.exceptions import RayError
+
+        with self._lock:
+            actor, call = self._actor, self._progress_call
+            try:
+                if call is not None and ray.wait([call], timeout=0)[0]:
+                    self._progress_call = None
+                    self._progress = ray.get(call)
+                elif call is not None:
+                    return self._progress
+                now = time.monotonic()
+                if actor is not None and now - self._progress_asked_s >= _PROGRESS_INTERVAL_S:
+                    self._progress_asked_s = now
+                    self._progress_call = actor.progress.remote()
+            except RayError:
+                self._progress_call = None  # The task itself will tell that the process died.
+            return self._progress
+
+    def cancel(self) -> None:
+        from ray.exceptions import RayError
+
+        if self._actor is not None:
+            with contextlib.suppress(RayError):
+                self._actor.cancel.remote()
+
+    def kill(self) -> None:
+        import ray
+
+        actor, pid = self._actor, self._pid
+        self._actor = self._pid = self._task = None
+        with self._lock:
+            self._progress, self._progress_call = SlotProgress(), None
+        if actor is None:
+            return
+        with contextlib.suppress(Exception):  # Ray itself may be gone; then so is the actor.
+            ray.kill(actor, no_restart=True)
+        if self._private and pid is not None:  # Does not wait for a worker that hangs with its lock held.
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(pid, signal.SIGKILL)
+
+
+class RayExecutor:
+    """An `Executor` on Ray."""
+
+    def __init__(self, config: AgentConfig) -> None:
+        self._config = config
+        self._private = config.ray_address is None
+        self._temp_dir: Path | None = None
+        self._slots: list[RaySlot] = []
+
+    def start(self) -> None:
+        """Start a private Ray, or join a cluster as its driver.
+
+        Raises:
+            ConnectionError: The cluster does not answer.
+        """
+        started = time.monotonic()
+        if self._private:
+            self._start_private()
+        else:
+            import ray
+
+            ray.init(
+                address=self._config.ray_address,
+                namespace=_NAMESPACE,
+                log_to_driver=False,
+                configure_logging=False,
+            )
+        actor_class = self._actor_class()
+        self._slots = [RaySlot(actor_class, self._config, private=self._private) for _ in range(self._config.slots)]
+        logger.info("Ray is ready after %.1f s", time.monotonic() - started)
+
+    def slots(self) -> list[SlotHandle]:
+        return list(self._slots)
+
+    def stop(self) -> None:
+        import ray
+
+        for slot in self._slots:
+            slot.kill()
+        self._slots = []
+        ray.shutdown()
+        if self._temp_dir is not None:
+            shutil.rmtree(self._temp_dir, ignore_errors=True)
+
+    def _start_private(self) -> None:
+        config = self._config
+        os.environ.update(_PRIVATE_ENVIRONMENT)
+        if "RAY_AUTH_MODE" not in os.environ:
+            # Whoever reaches Ray's ports runs code as this user: a token that only this process and its children know.
+            os.environ["RAY_AUTH_MODE"] = "token"
+            os.environ.setdefault("RAY_AUTH_TOKEN", secrets.token_hex(32))
+        import ray
+
+        self._temp_dir = private_temp_dir(config.scratch_dir.parent)
+        gpus = math.ceil(config.slots * config.gpus_per_slot) if config.device == "cuda" else 0
+        logging.getLogger("ray").setLevel(logging.ERROR)  # It warns about every thread that is not the main one.
+        ray.init(
+            address="local",
+            num_cpus=config.slots * config.cpus_per_slot,
+            num_gpus=gpus,
+            object_store_memory=_OBJECT_STORE_BYTES,
+            include_dashboard=False,
+            log_to_driver=False,
+            configure_logging=False,
+            namespace=_NAMESPACE,
+            _temp_dir=str(self._temp_dir),
+        )
+
+    def _actor_class(self) -> Any:
+        import ray
+
+        config = self._config
+        threads = str(config.cpus_per_slot)
+        for beside_the_task in (SlotActor.progress, SlotActor.cancel):
+            ray.method(concurrency_group="control")(beside_the_task)  # Marks the function.
+        return ray.remote(
+            num_cpus=config.cpus_per_slot,
+            num_gpus=config.gpus_per_slot if config.device == "cuda" else 0,
+            max_restarts=0,
+            max_task_retries=0,
+            concurrency_groups={"control": 2},
+            runtime_env={"env_vars": {**dict.fromkeys(_THREAD_VARIABLES, threads), "OMP_WAIT_POLICY": "passive"}},
+        )(SlotActor)
+
+
+def private_temp_dir(preferred: Path) -> Path:
+    """A new folder for a private Ray, short enough for its sockets; leftovers of dead processes are removed."""
+    pid = os.getpid()
+    names = (
+        preferred / f"ray-{pid}",
+        Path(tempfile.gettempdir()) / f"vipe-ray-{os.getuid()}-{pid}",
+        Path(f"/tmp/vipe-ray-{os.getuid()}-{pid}"),
+    )
+    chosen = next((name for name in names if len(str(name)) + _SESSION_PATH_CHARS <= _MAX_SOCKET_PATH), names[-1])
+    for old in chosen.parent.glob(chosen.name.removesuffix(str(pid)) + "*"):
+        owner = old.name.rsplit("-", 1)[-1]
+        if owner.isdigit() and not Path(f"/proc/{owner}").exists():
+            shutil.rmtree(old, ignore_errors=True)
+    chosen.mkdir(parents=True, exist_ok=True, mode=0o700)
+    return chosen
+
+
+def _died(error: Exception) -> Died:
+    """One line out of Ray's paragraph."""
+    from ray.exceptions import ActorDiedError, GetTimeoutError, NodeDiedError, OutOfMemoryError
+
+    if isinstance(error, GetTimeoutError):
+        return Died("the process was not ready in time")
+    if isinstance(error, OutOfMemoryError):
+        return Died("the machine ran out of memory, Ray ended the process")
+    preempted = isinstance(error, NodeDiedError) or (isinstance(error, ActorDiedError) and error.preempted)
+    text = " ".join(str(error).split())
+    for known in ("out of memory", "node has died", "killed by `ray.kill`"):
+        if known in text and "OOM killer" not in text:
+            return Died(f"{type(error).__name__}: {known}", preempted or known == "node has died")
+    if "connection error code 2" in text:
+        return Died("the process ended without a word: a crash, or it was killed", preempted)
+    return Died(f"{type(error).__name__}: {text[-300:]}", preempted)

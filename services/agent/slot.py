@@ -1,0 +1,212 @@
+"""The inside of a worker process: a warm engine, one task at a time, and a second thread that can look and interrupt.
+
+Nothing here knows how the process was started. A task never raises: what goes wrong becomes a `Failed` answer with a
+stable code, so that only a dead process looks like a dead process.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+import traceback
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from services.agent.engine import Engine, load_opener
+from services.agent.messages import (
+    Annotated,
+    AnnotateVideo,
+    Answer,
+    Cancelled,
+    Discarded,
+    DiscardShard,
+    Failed,
+    FailureScope,
+    Opened,
+    OpenShard,
+    Packed,
+    PackShard,
+    Reply,
+    SlotProgress,
+    Task,
+)
+from services.agent.scratch import ShardScratch, sweep
+from services.agent.traffic import TrafficRecorder
+from services.commit.protocol import prepare_payload
+from services.domain.errors import InputUnavailable, ObjectMissing, ServiceError, StorageError
+from services.domain.models import VideoRef, VideoResult
+from services.domain.states import VideoStatus
+from services.storage import open_store
+from vipe_core.errors import EngineError, VipeError
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class SlotConfig:
+    """What a worker process must know; the meaning of each is that of `AgentConfig`."""
+
+    scratch_dir: Path
+    device: str
+    engine: str
+    s3_endpoint_url: str | None
+    scratch_max_age_s: float
+
+
+class _Interrupted(BaseException):
+    """Raised from the engine's progress callback. Not an Exception, so that no stage mistakes it for a failure."""
+
+
+class _JobFailure(Exception):
+    """The engine cannot be opened for this job at all."""
+
+    def __init__(self, cause: VipeError) -> None:
+        super().__init__(str(cause))
+        self.cause = cause
+
+
+class Slot:
+    """One worker. `run` from one thread; `progress` and `cancel` from another."""
+
+    def __init__(self, config: SlotConfig) -> None:
+        self._config = config
+        self._engines: dict[tuple[str, str], Engine] = {}
+        self._traffic = TrafficRecorder()
+        self._cancel = threading.Event()
+        self._progress = SlotProgress()
+        config.scratch_dir.mkdir(parents=True, exist_ok=True)
+        sweep(config.scratch_dir, config.scratch_max_age_s)
+
+    def run(self, task: Task) -> Reply:
+        """Do one task to its end. Never raises."""
+        self._cancel.clear()
+        try:
+            answer = self._answer(task)
+        except _Interrupted:
+            answer = Cancelled()
+        finally:
+            self._progress = SlotProgress()
+        return Reply(answer, self._traffic.take())
+
+    def progress(self) -> SlotProgress:
+        return self._progress
+
+    def cancel(self) -> None:
+        """Stop the task in flight at its next sign of progress."""
+        self._cancel.set()
+
+    def _answer(self, task: Task) -> Answer:
+        scope: FailureScope = "video" if isinstance(task, AnnotateVideo) else "shard"
+        try:
+            match task:
+                case AnnotateVideo():
+                    return self._annotate(task)
+                case PackShard():
+                    return self._pack(task)
+                case OpenShard():
+                    return Opened(ShardScratch(self._config.scratch_dir, task.lease).open())
+                case DiscardShard():
+                    ShardScratch(self._config.scratch_dir, task.lease).discard()
+                    return Discarded()
+        except _JobFailure as error:
+            return Failed(error.cause.code, str(error), retryable=False, scope="job")
+        except ObjectMissing as error:
+            return Failed(InputUnavailable.code if scope == "video" else error.code, str(error), False, scope)
+        except StorageError as error:
+            return Failed(error.code, str(error), retryable=True, scope="storage")
+        except (ServiceError, VipeError) as error:
+            return Failed(error.code, str(error), error.retryable, scope)
+        except OSError as error:
+            message = f"the scratch folder {self._config.scratch_dir} failed: {error.strerror or error}"
+            return Failed(StorageError.code, message, True, "storage", traceback.format_exc())
+        except Exception as error:
+            return _unforeseen(error, f"{type(task).__name__} of {task.lease.shard_id}", scope)
+
+    def _annotate(self, task: AnnotateVideo) -> Answer:
+        lease, video = task.lease, task.video
+        started = time.perf_counter()
+        self._progress = SlotProgress(video.key, "fetch")
+        scratch = ShardScratch(self._config.scratch_dir, lease)
+        engine = self._engine(lease.spec.preset, lease.spec.camera)
+        path, fetch_s = self._fetch(video, scratch)
+        root = scratch.staging()
+        failure: Failed
+        try:
+            result = engine.annotate(path, video, lease.spec, root, self._report)
+        except VipeError as error:
+            failure = Failed(error.code, _one_line(error, path, video), retryable=error.retryable)
+        except MemoryError as error:
+            failure = Failed(EngineError.code, f"{video.uri}: {_one_line(error, path, video)}", retryable=True)
+        except OSError as error:
+            if error.filename is None or not Path(str(error.filename)).is_relative_to(self._config.scratch_dir):
+                failure = _unforeseen(error, video.uri)
+            else:
+                raise
+        except Exception as error:
+            failure = _unforeseen(error, video.uri)
+        else:
+            timings = {**({"fetch": fetch_s} if fetch_s else {}), **(result.timings_s or {})}
+            seconds = round(time.perf_counter() - started, 4)
+            result = replace(result, attempt=lease.attempt, seconds=seconds, timings_s=timings)
+            scratch.keep(result)
+            return Annotated(result)
+        finally:
+            if path.is_relative_to(scratch.path):
+                path.unlink(missing_ok=True)
+        scratch.staging()
+        if not failure.retryable:
+            scratch.keep(failed_row(video, lease.attempt, failure.code, failure.message))
+        return failure
+
+    def _pack(self, task: PackShard) -> Answer:
+        self._progress = SlotProgress(None, "pack")
+        scratch = ShardScratch(self._config.scratch_dir, task.lease)
+        output = open_store(task.lease.spec.output, endpoint_url=self._config.s3_endpoint_url, observer=self._traffic)
+        return Packed(prepare_payload(task.lease, task.results, scratch.artifacts, scratch.tars, output))
+
+    def _engine(self, preset: str, camera: str) -> Engine:
+        engine = self._engines.get((preset, camera))
+        if engine is None:
+            try:
+                engine = load_opener(self._config.engine)(preset, camera, self._config.device)
+            except VipeError as error:
+                raise _JobFailure(error) from error
+            self._engines = {(preset, camera): engine}  # One at a time: another preset's weights would stay in memory.
+        return engine
+
+    def _fetch(self, video: VideoRef, scratch: ShardScratch) -> tuple[Path, float]:
+        """A local path of the input, and the seconds that it took to get it."""
+        if not video.uri.startswith("s3://"):
+            return Path(video.uri.removeprefix("file://")), 0.0
+        started = time.perf_counter()
+        bucket, _, key = video.uri.removeprefix("s3://").partition("/")
+        store = open_store(f"s3://{bucket}", endpoint_url=self._config.s3_endpoint_url, observer=self._traffic)
+        path = scratch.input_path(video.key, Path(key).suffix)
+        store.download(key, path)
+        return path, round(time.perf_counter() - started, 4)
+
+    def _report(self, stage: str, frames_done: int, frames_total: int | None, share: float) -> None:
+        if self._cancel.is_set():
+            raise _Interrupted
+        expected = frames_total or self._progress.frames_expected
+        done = int(share * expected) if expected else 0
+        self._progress = replace(self._progress, stage=stage, frames_done=done, frames_expected=expected)
+
+
+def failed_row(video: VideoRef, attempt: int, code: str, message: str) -> VideoResult:
+    """The index row of a video that has no artifacts."""
+    return VideoResult(video.key, video.uri, VideoStatus.FAILED, attempt, error_code=code, error_message=message)
+
+
+def _one_line(error: BaseException, path: Path, video: VideoRef) -> str:
+    """The first line of an error, speaking of the address that the user gave instead of our copy."""
+    text = (str(error) or type(error).__name__).replace(str(path), video.uri)
+    return text.splitlines()[0][:500]
+
+
+def _unforeseen(error: Exception, what: str, scope: FailureScope = "video") -> Failed:
+    detail = traceback.format_exc()
+    first_line = (str(error) or "no message").splitlines()[0][:300]
+    message = f"{what}: {type(error).__name__}: {first_line}; please report it with the agent's log"
+    return Failed(EngineError.code, message, False, scope, detail)

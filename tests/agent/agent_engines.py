@@ -1,0 +1,124 @@
+"""Engines for the agent's tests: the "video" is a small text file that says what happens to whoever opens it.
+
+    frames=12            a success with so many frames
+    error                a typed error of the input
+    bug                  an exception that nobody foresaw
+    die                  the worker process dies, every time
+    die-once=PATH        dies if PATH does not exist, and creates it
+    hang                 never comes back
+    slow=SECONDS         takes its time, reporting progress
+    flaky=PATH           a retryable typed error, once
+    count=PATH           appends a line to PATH before anything else
+
+They write real artifacts with the engine's own writer, so that everything behind them is the real thing.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from services.agent.engine import ProgressCallback, index_row
+from services.domain.models import JobSpec, VideoRef, VideoResult
+from vipe_core.annotation import Annotation, DenseFrame, Provenance, Quality
+from vipe_core.cameras import Camera
+from vipe_core.errors import ConfigError, CorruptMedia, DecodeCrashed
+from vipe_core.formats import write_artifacts
+
+WIDTH, HEIGHT = 16, 12
+
+
+class ProcessDeath(BaseException):
+    """Stands for the death of the process in the in-memory executor."""
+
+
+class ProcessHang(BaseException):
+    """Stands for a process that never answers in the in-memory executor."""
+
+
+class ScriptedEngine:
+    def __init__(self, *, real_process: bool) -> None:
+        self._real_process = real_process
+
+    def annotate(
+        self, path: Path, video: VideoRef, spec: JobSpec, root: Path, progress: ProgressCallback
+    ) -> VideoResult:
+        script = dict(part.partition("=")[::2] for part in path.read_text().split())
+        frames = int(script.get("frames", "4"))
+        progress("track", 0, frames, 0.0)
+        if "count" in script:
+            with Path(script["count"]).open("a") as log:
+                log.write(f"{video.key}\n")
+        if "error" in script:
+            raise CorruptMedia(f"{path}: not a video")
+        if "bug" in script:
+            raise ValueError("a defect\nwith a second line")
+        if "flaky" in script and not Path(script["flaky"]).exists():
+            Path(script["flaky"]).touch()
+            raise DecodeCrashed(f"{path}: the decoder died")
+        if "die" in script:
+            self._die()
+        if "die-once" in script and not Path(script["die-once"]).exists():
+            Path(script["die-once"]).touch()
+            self._die()
+        if "hang" in script:
+            if not self._real_process:
+                raise ProcessHang
+            time.sleep(3600)
+        started = time.monotonic()
+        while (spent := time.monotonic() - started) < float(script.get("slow", 0)):
+            progress("track", int(spent * 10), frames, 0.1)
+            time.sleep(0.05)
+        annotation = fake_annotation(video.key, frames)
+        write_artifacts(annotation, root, attributes=["pose", "intrinsics", "depth"])
+        progress("dense", frames, frames, 1.0)
+        return index_row(annotation, video)
+
+    def _die(self) -> None:
+        if not self._real_process:
+            raise ProcessDeath
+        os.kill(os.getpid(), signal.SIGSEGV)
+        time.sleep(60)
+
+
+def open_in_memory(preset: str, camera: str, device: str) -> ScriptedEngine:
+    if preset == "absent":
+        raise ConfigError("there is no preset 'absent'")
+    return ScriptedEngine(real_process=False)
+
+
+def open_in_process(preset: str, camera: str, device: str) -> ScriptedEngine:
+    return ScriptedEngine(real_process=True)
+
+
+def fake_annotation(name: str, frames: int) -> Annotation:
+    """A straight walk with a constant depth."""
+    poses = np.tile(np.eye(4), (frames, 1, 1))
+    poses[:, 2, 3] = np.arange(frames) * 0.1
+
+    def dense() -> Iterator[DenseFrame]:
+        for index in range(frames):
+            shape = (HEIGHT, WIDTH)
+            yield DenseFrame(
+                index, np.zeros((*shape, 3), np.uint8), np.full(shape, 2.0, np.float32), np.ones(shape, np.float32)
+            )
+
+    return Annotation(
+        name=name,
+        world_from_cam=poses,
+        camera=Camera.pinhole_from_fov(60.0, WIDTH, HEIGHT),
+        timestamps_s=np.arange(frames) / 10.0,
+        fps=10.0,
+        keyframes=np.array([0], np.int64),
+        scale="relative",
+        depth_kind="z",
+        quality=Quality("yes", (), 0.5, 0.9, 0.8, 3.0, 0.01, np.ones(frames, np.float32)),
+        provenance=Provenance("0", "classical", "0" * 64, "cpu", {}, {}, {}, {"name": name}),
+        dense=dense,
+        timings_s={"track": 0.01},
+    )

@@ -1,0 +1,277 @@
+"""The supervisor's decisions, with the real store, output and worker code, and deaths made to order."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from agent_rig import Rig
+
+from services.agent.leases import StopReason
+from services.agent.messages import AnnotateVideo, PackShard
+from services.domain.errors import StorageError
+from services.domain.states import JobState, ShardState, VideoStatus
+
+
+@pytest.fixture
+def rig(tmp_path: Path) -> Rig:
+    return Rig.make(tmp_path)
+
+
+def _shard_state(rig: Rig, job_id: str) -> ShardState:
+    (shard,), _ = rig.store.list_shards(job_id)
+    return shard.state
+
+
+def test_good_and_bad_inputs_become_one_committed_shard(rig: Rig) -> None:
+    job_id = rig.job({"good": "frames=5", "corrupt": "error", "defect": "bug"})
+    live = rig.lease()
+    assert rig.supervisor.work(live).kind == "committed"
+    rows = rig.rows(live)
+    assert (rows["good"].status, rows["good"].num_frames) == (VideoStatus.SUCCEEDED, 5)
+    assert (rows["corrupt"].status, rows["corrupt"].error_code) == (VideoStatus.FAILED, "media_corrupt")
+    assert rows["defect"].error_code == "engine_failed"
+    assert "a defect" in str(rows["defect"].error_message)
+    assert "\n" not in str(rows["defect"].error_message)
+    assert _shard_state(rig, job_id) is ShardState.COMMITTED
+    assert rig.metric("vipe_frames_total") == 5
+    assert rig.metric("vipe_videos_total", outcome="failed", error_class="media_corrupt") == 1
+    assert rig.slot.starts == 1
+    assert not any(rig.config.scratch_dir.iterdir())
+
+
+def test_a_death_costs_one_try_and_no_finished_video(rig: Rig, tmp_path: Path) -> None:
+    count = tmp_path / "count"
+    rig.job({"a": f"frames=3 count={count}", "b": f"die-once={tmp_path / 'died'} count={count}", "c": f"count={count}"})
+    live = rig.lease()
+    assert rig.supervisor.work(live).kind == "committed"
+    assert {row.status for row in rig.rows(live).values()} == {VideoStatus.SUCCEEDED}
+    tried = [line.rsplit("-", 1)[0] for line in count.read_text().split()]
+    assert sorted(tried) == ["a", "b", "b", "c"]
+    assert rig.slot.starts == 2
+    assert rig.metric("vipe_actor_restarts_total", reason="died") == 1
+
+
+def test_a_video_that_always_kills_is_tried_last_and_quarantined(rig: Rig) -> None:
+    rig.job({"a-poison": "die", "b": "frames=3", "c": "frames=3"})
+    live = rig.lease()
+    assert rig.supervisor.work(live).kind == "committed"
+    rows = rig.rows(live)
+    assert rows["a-poison"].status is VideoStatus.QUARANTINED
+    assert rows["a-poison"].error_code == "worker_died"
+    assert "a-poison.mp4" in str(rows["a-poison"].error_message)
+    assert rows["b"].status is rows["c"].status is VideoStatus.SUCCEEDED
+    assert rig.slot.annotated() == ["a-poison", "b", "c", "a-poison", "a-poison"]
+    assert rig.metric("vipe_quarantined_videos") == 1
+
+
+def test_deaths_of_an_earlier_lease_are_remembered(rig: Rig) -> None:
+    rig.job({"poison": "die", "b": "frames=3"})
+    first = rig.lease()
+    for _ in range(2):
+        rig.store.blame(first.lease.shard_id, first.lease.fence, first.lease.videos[0].key, "before")
+    rig.store.release(first.lease.shard_id, first.lease.fence, "restart")
+    live = rig.lease()
+    assert live.lease.spent == {first.lease.videos[0].key: 2}
+    rig.supervisor.work(live)
+    assert rig.rows(live)["poison"].status is VideoStatus.QUARANTINED
+    assert rig.slot.annotated() == ["b", "poison"]
+
+
+def test_a_slot_on_which_everything_dies_is_fenced_and_blames_nobody_for_good(rig: Rig) -> None:
+    job_id = rig.job({name: "die" for name in "abcd"})
+    live = rig.lease()
+    outcome = rig.supervisor.work(live)
+    assert (outcome.kind, outcome.fenced) == ("given_back", True)
+    assert rig.slot.annotated() == ["a", "b", "c"]
+    assert _shard_state(rig, job_id) is ShardState.PENDING
+    assert rig.record(live) is None
+
+
+def test_a_fenced_slot_that_is_pardoned_ends_the_job_after_all(rig: Rig) -> None:
+    rig.job({name: "die" for name in "abcd"})
+    for _ in range(20):
+        live = rig.lease()
+        outcome = rig.supervisor.work(live)
+        if outcome.kind == "committed":
+            break
+        assert outcome.fenced
+        rig.supervisor.pardon()
+    assert {row.status for row in rig.rows(live).values()} == {VideoStatus.QUARANTINED}
+
+
+def test_a_process_that_died_while_idle_is_nobodys_fault(rig: Rig) -> None:
+    rig.job({"a": "frames=3"})
+    assert rig.supervisor.start()
+    rig.slot.dies_idle = True
+    live = rig.lease()
+    assert rig.supervisor.work(live).kind == "committed"
+    assert rig.slot.annotated() == ["a"]
+    assert rig.slot.starts == 2
+
+
+def test_a_hanging_video_is_killed_after_its_budget(rig: Rig) -> None:
+    rig.job({"a": "hang", "b": "frames=3"})
+    live = rig.lease()
+    assert rig.supervisor.work(live).kind == "committed"
+    rows = rig.rows(live)
+    assert rows["a"].error_code == "video_timeout"
+    assert rows["b"].status is VideoStatus.SUCCEEDED
+    assert rig.config.video_budget_base_s < rig.clock.now_s < rig.config.video_budget_base_s + 2
+    assert rig.metric("vipe_actor_restarts_total", reason="video_timeout") == 1
+
+
+def test_a_retryable_error_gets_a_second_try(rig: Rig, tmp_path: Path) -> None:
+    rig.job({"a": f"flaky={tmp_path / 'flaked'}"})
+    live = rig.lease()
+    assert rig.supervisor.work(live).kind == "committed"
+    assert rig.rows(live)["a"].status is VideoStatus.SUCCEEDED
+    assert rig.slot.annotated() == ["a", "a"]
+
+
+def test_a_cancelled_job_stops_within_seconds_and_commits_nothing(rig: Rig) -> None:
+    job_id = rig.job({"a": "hang", "b": "frames=3"})
+    live = rig.lease()
+    rig.store.request_cancel(job_id)
+    rig.slot.before_poll = [None, rig.book.renew]
+    outcome = rig.supervisor.work(live)
+    assert (outcome.kind, outcome.reason) == ("stopped", StopReason.CANCELLED)
+    assert rig.clock.now_s < 5
+    assert rig.record(live) is None
+    assert rig.store.get_job(job_id).state is JobState.CANCELLED
+
+
+def test_a_worker_that_does_not_obey_is_killed(rig: Rig) -> None:
+    rig.job({"a": "hang"})
+    live = rig.lease()
+    rig.slot.obeys_cancel = False
+    rig.slot.before_poll = [None, lambda: live.stop(StopReason.DRAINED)]
+    assert rig.supervisor.work(live).reason == StopReason.DRAINED
+    assert rig.config.cancel_grace_s < rig.clock.now_s < rig.config.cancel_grace_s + 2
+    assert rig.supervisor.start()
+    assert rig.slot.starts == 2
+
+
+def test_a_drained_shard_goes_on_where_it_was(rig: Rig, tmp_path: Path) -> None:
+    count = tmp_path / "count"
+    rig.job({"a": f"frames=3 count={count}", "b": f"frames=3 count={count}"})
+    live = rig.lease()
+    # open, a, b: stop while b runs, before its reply is read.
+    rig.slot.before_poll = [None, None, lambda: (live.stop(StopReason.DRAINED), setattr(rig.slot, "_outcome", None))]
+    assert rig.supervisor.work(live).reason == StopReason.DRAINED
+    again = rig.lease()
+    assert again.lease.attempt == 2
+    assert rig.supervisor.work(again).kind == "committed"
+    assert len(rig.rows(again)) == 2
+    assert [line.rsplit("-", 1)[0] for line in count.read_text().split()] == ["a", "b"]
+
+
+def test_a_lost_lease_is_not_committed(rig: Rig) -> None:
+    job_id = rig.job({"a": "frames=3"})
+    live = rig.lease()
+
+    def steal() -> None:
+        rig.store.release(live.lease.shard_id, live.lease.fence, "stolen")
+        rig.lease()
+
+    rig.slot.before_poll = [None, None, steal]  # While the tars are uploaded.
+    outcome = rig.supervisor.work(live)
+    assert (outcome.kind, outcome.reason) == ("stopped", StopReason.LOST)
+    assert rig.record(live) is None
+    assert _shard_state(rig, job_id) is ShardState.LEASED
+    assert rig.metric("vipe_commit_conflicts_total", result="lost_lease") == 1
+
+
+def test_a_record_without_its_database_row_is_found_and_not_done_again(
+    rig: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    job_id = rig.job({"a": "frames=3"})
+    first = rig.lease()
+    with monkeypatch.context() as patch:
+        patch.setattr(rig.committer, "record", lambda record: True)  # Dies between the record and the database.
+        rig.supervisor.work(first)
+    assert rig.record(first) is not None
+    assert _shard_state(rig, job_id) is ShardState.LEASED
+    rig.store.release(first.lease.shard_id, first.lease.fence, "expired")
+    handed_over = len(rig.slot.tasks)
+    again = rig.lease()
+    assert rig.supervisor.work(again).kind == "committed"
+    assert not any(isinstance(task, AnnotateVideo | PackShard) for task in rig.slot.tasks[handed_over:])
+    assert _shard_state(rig, job_id) is ShardState.COMMITTED
+    assert rig.metric("vipe_frames_total") == 3
+
+
+def test_a_preset_that_cannot_work_fails_the_job_at_once(rig: Rig) -> None:
+    job_id = rig.job({"a": "frames=3", "b": "frames=3"}, preset="absent")
+    live = rig.lease()
+    assert rig.supervisor.work(live).kind == "job_failed"
+    job = rig.store.get_job(job_id)
+    assert (job.state, job.error_code) == (JobState.FAILED, "invalid_config")
+    assert "absent" in str(job.error_message)
+    assert rig.slot.annotated() == ["a"]
+
+
+def test_unreachable_output_gives_the_lease_back_and_then_goes_on(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+    job_id = rig.job({"a": "frames=3"})
+    live = rig.lease()
+
+    def down(*_: object) -> None:
+        raise StorageError("the bucket does not answer")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(rig.committer, "write", down)
+        outcome = rig.supervisor.work(live)
+    assert (outcome.kind, outcome.storage_failed) == ("given_back", True)
+    assert _shard_state(rig, job_id) is ShardState.PENDING
+    again = rig.lease()
+    assert rig.supervisor.work(again).kind == "committed"
+    assert rig.slot.annotated() == ["a"]  # The artifacts were still there.
+
+
+def test_an_input_that_can_never_be_fetched_becomes_a_row_in_the_end(tmp_path: Path) -> None:
+    rig = Rig.make(tmp_path, max_give_backs=2, storage_tries=2)
+    rig.job({"a": "frames=3"})
+    # A directory in the way of scratch makes every fetch fail the way a full disk does.
+    outcomes = []
+    for _ in range(3):
+        live = rig.lease()
+        object.__setattr__(live.lease.videos[0], "uri", "s3://bucket/a.mp4")
+        monkey = pytest.MonkeyPatch()
+        monkey.setattr("services.agent.slot.open_store", _unreachable)
+        outcomes.append(_work_with_local_output(rig, live, monkey))
+    assert outcomes == ["given_back", "given_back", "committed"]
+    assert next(iter(rig.rows(live).values())).error_code == "input_unavailable"
+
+
+def _work_with_local_output(rig: Rig, live: object, monkey: pytest.MonkeyPatch) -> str:
+    try:
+        return rig.supervisor.work(live).kind  # type: ignore[arg-type]
+    finally:
+        monkey.undo()
+
+
+def _unreachable(uri: str, **options: object) -> object:
+    from services.storage import open_store
+
+    if uri.startswith("s3://"):
+        raise StorageError(f"{uri} does not answer")
+    return open_store(uri, **options)  # type: ignore[arg-type]
+
+
+def test_no_worker_process_at_all_fences_the_slot(rig: Rig) -> None:
+    rig.job({"a": "frames=3"})
+    live = rig.lease()
+    rig.slot.start_failures = 3
+    outcome = rig.supervisor.work(live)
+    assert (outcome.kind, outcome.fenced) == ("given_back", True)
+    assert rig.metric("vipe_actor_restarts_total", reason="start_failed") == 3
+    assert rig.supervisor.work(rig.lease()).kind == "committed"
+
+
+def test_progress_counts_finished_videos_and_expects_the_rest_to_be_alike(rig: Rig) -> None:
+    rig.job({"a": "frames=4", "b": "frames=8", "c": "hang"})
+    live = rig.lease()
+    reports = []
+    rig.slot.before_poll = [None, None, None, lambda: reports.append(live.report())]
+    rig.supervisor.work(live)
+    assert (reports[0].videos_done, reports[0].frames_done, reports[0].frames_expected) == (2, 12, 18)
