@@ -1,0 +1,147 @@
+"""Dense depth of every frame, in order, in memory that does not grow with the clip.
+
+Two decoders run through the video: one ahead at the working size, whose gray pictures fill a sliding window, and one
+behind it at source size, whose pictures go out with the depth. Between them, a few depth maps wait for the later frames
+that confirm them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import closing
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from vipe_core.depth.completion import complete
+from vipe_core.depth.geometry import KeyframePrior, Prior, choose_sources, relative
+from vipe_core.depth.kernels import check, upsample
+from vipe_core.depth.sweep import PlaneSweep, RawDepth
+from vipe_core.depth.types import DepthFrame, DepthSettings, SceneMap
+from vipe_core.errors import EngineError
+from vipe_core.video.source import Frame, FrameSource
+
+Array = NDArray[Any]
+
+# What a completion filter believes the keyframes, relative to a confirmed measurement, where nothing was confirmed.
+_PRIOR_SHARE = 0.2
+_MIN_SCORE = 0.2
+_EDGE = 6.0
+_SAME = 0.05
+
+
+class DenseDepth:
+    """The depth stage; reusable for any number of videos."""
+
+    def __init__(self, settings: DepthSettings | None = None) -> None:
+        self._settings = settings or DepthSettings()
+
+    def stream(self, source: FrameSource, scene: SceneMap) -> Iterator[DepthFrame]:
+        """Depth of every frame of the video, in order; closing the iterator stops the decoders.
+
+        Frames without parallax (a static camera, pure rotation) get the keyframes' inverse depth carried into them and
+        filled up, with confidence 0 where nothing was measured.
+
+        Raises:
+            InputError, DecodeError: From the source.
+            EngineError: The video has fewer frames than there are poses.
+        """
+        return self._stream(source, scene)
+
+    def _stream(self, source: FrameSource, scene: SceneMap) -> Iterator[DepthFrame]:
+        settings = self._settings
+        num_frames = len(scene.world_from_cam)
+        size = (scene.camera.width, scene.camera.height)
+        reach = max(settings.check_frames, default=0)
+        sweep, keyframes = PlaneSweep(scene, settings), KeyframePrior(scene)
+        halves: dict[int, Array] = {}
+        raws: dict[int, RawDepth] = {}
+        priors: dict[int, Prior] = {}
+        with closing(_guarded(source.frames(size=size))) as ahead, closing(_guarded(source.frames())) as behind:
+            decoded = 0
+            for t in range(num_frames + reach):
+                if t < num_frames:
+                    while decoded < min(num_frames, t + settings.window_frames + 1):
+                        halves[decoded] = _half_gray(_next(ahead, decoded, num_frames))
+                        decoded += 1
+                    priors[t] = keyframes.of(t)
+                    chosen = choose_sources(scene, sweep.coarse, priors[t], t, settings)
+                    raws[t] = sweep.depth(t, halves[t], {j: halves[j] for j in chosen}, priors[t])
+                done = t - reach
+                if done >= 0:
+                    picture = _next(behind, done, num_frames)
+                    yield self._finish(done, picture, halves[done], raws, priors.pop(done), scene, sweep)
+                    raws.pop(done - reach, None)
+                halves.pop(min(t, done) - settings.window_frames, None)
+
+    def _finish(
+        self,
+        index: int,
+        picture: Frame,
+        half: Array,
+        raws: dict[int, RawDepth],
+        prior: Prior,
+        scene: SceneMap,
+        sweep: PlaneSweep,
+    ) -> DepthFrame:
+        """Confirms, fuses, fills and enlarges the depth of one frame."""
+        settings, view, raw = self._settings, sweep.fine, raws[index]
+        gray = half.astype(np.float32)
+        height, width = half.shape
+        prior_value = cv2.resize(prior.inverse_depth, (width, height), interpolation=cv2.INTER_LINEAR)
+        prior_trust = cv2.resize(prior.confidence, (width, height), interpolation=cv2.INTER_LINEAR)
+        value, confidence = raw.inverse_depth, np.zeros_like(gray)
+        if raw.measured:
+            votes, ratios = np.zeros_like(gray), np.zeros_like(gray)
+            asked = 0
+            for j in (index + s * d for d in settings.check_frames for s in (-1, 1)):
+                other = raws.get(j)
+                if other is None or not other.measured:
+                    continue
+                asked += 1
+                motion = relative(scene.world_from_cam, index, j)
+                check(
+                    value,
+                    view.rays,
+                    other.inverse_depth,
+                    motion[:3, :3].astype(np.float32),
+                    motion[:3, 3].astype(np.float32),
+                    view.model,
+                    view.params,
+                    settings.check_tolerance,
+                    votes,
+                    ratios,
+                )
+            agrees = prior_trust * (np.abs(value / prior_value - 1) < settings.check_tolerance)
+            share = votes / asked if asked else np.zeros_like(votes)
+            confidence = np.maximum(share, 0.5 * agrees) * np.clip((raw.score - _MIN_SCORE) / 0.5, 0.05, 1)
+            confidence[np.maximum(share, agrees) < 0.3] = 0
+            value = value * (1 + ratios) / (1 + votes)
+        weight = np.where(confidence > 0, np.maximum(confidence, 0.2), _PRIOR_SHARE * prior_trust)
+        start = np.where(confidence > 0, value, prior_value)
+        filled = complete(start, weight.astype(np.float32), gray, prior_value)
+        filled = np.clip(filled, 0.2 * prior.low, 4 * prior.high)
+        # A value that only the keyframes know counts as measured as far as they are sure.
+        confidence = np.where(confidence > 0, confidence, 0.3 * prior_trust)
+        full_gray = cv2.cvtColor(picture.rgb, cv2.COLOR_RGB2GRAY)
+        depth, sure = upsample(filled.astype(np.float32), confidence.astype(np.float32), gray, full_gray, _EDGE, _SAME)
+        return DepthFrame(index, picture.rgb, depth, np.clip(sure, 0, 1))
+
+
+def _half_gray(frame: Frame) -> NDArray[np.uint8]:
+    gray = cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY)
+    return np.asarray(cv2.resize(gray, (gray.shape[1] // 2, gray.shape[0] // 2), interpolation=cv2.INTER_AREA))
+
+
+def _guarded(frames: Iterator[Frame]) -> Iterator[Frame]:
+    """A generator over any iterator, so that it can be closed."""
+    yield from frames
+
+
+def _next(frames: Iterator[Frame], index: int, num_frames: int) -> Frame:
+    frame = next(frames, None)
+    if frame is None:
+        raise EngineError(f"the video gave {index} frames to the depth stage, but {num_frames} poses were found in it")
+    return frame

@@ -1,0 +1,98 @@
+"""What the depth stage is given and what it yields."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vipe_core.cameras import Camera
+
+
+@dataclass(frozen=True, slots=True)
+class DepthSettings:
+    """Parameters of the depth stage. Lengths in pixels belong to the sweep image, a quarter of the working image.
+
+    Attributes:
+        window_frames: Sources are looked for among this many frames before and after a frame.
+        parallax_px: Wanted parallax of the near and the far source of each side, for a sweep image 160 pixels wide.
+        min_parallax_px: A source with less is not used.
+        min_overlap: Share of the picture that a source must see.
+        planes: Hypotheses of the coarse sweep, uniform in inverse depth.
+        fine_planes: Hypotheses around the coarse answer at half of the working resolution (odd).
+        fine_reach: How far they reach to either side, in coarse steps.
+        coarse_radius, fine_radius: Half sides of the matching windows.
+        noise: Variance of a flat window, (grey levels)^2: below it, correlation says nothing.
+        smooth_small: Penalty of a change by one plane between neighbours.
+        smooth_large: Penalty of a larger change.
+        smooth_edge: Grey-level difference that lowers `smooth_large` by a factor e.
+        prior_gain: Cost of leaving the inverse depth that bundle adjustment found, at full confidence.
+        prior_reach: Planes after which that cost no longer grows.
+        check_frames: Distances to the frames whose depth must agree.
+        check_tolerance: Relative difference in inverse depth that still agrees.
+    """
+
+    window_frames: int = 60
+    parallax_px: tuple[float, float] = (5.0, 13.0)
+    min_parallax_px: float = 0.7
+    min_overlap: float = 0.5
+    planes: int = 48
+    fine_planes: int = 9
+    fine_reach: float = 1.5
+    coarse_radius: int = 2
+    fine_radius: int = 2
+    noise: float = 2.0
+    smooth_small: float = 0.05
+    smooth_large: float = 0.6
+    smooth_edge: float = 12.0
+    prior_gain: float = 0.3
+    prior_reach: float = 3.0
+    check_frames: tuple[int, ...] = (3, 6)
+    check_tolerance: float = 0.03
+
+
+@dataclass(frozen=True, slots=True)
+class SceneMap:
+    """What is known of the camera and the scene before dense depth.
+
+    Attributes:
+        camera: At the working resolution (whose sides are multiples of 8).
+        world_from_cam: (N, 4, 4) float64, one pose per frame.
+        keyframes: (K,) int64 increasing frame indices.
+        inverse_depth: (K, h/8, w/8) float32 along the rays of the camera model, sampled at the centres of 8 x 8 blocks.
+        confidence: (K, h/8, w/8) float32 in 0..1; 0 where nothing was measured or where something moves.
+    """
+
+    camera: Camera
+    world_from_cam: NDArray[np.float64]
+    keyframes: NDArray[np.int64]
+    inverse_depth: NDArray[np.float32]
+    confidence: NDArray[np.float32]
+
+    def __post_init__(self) -> None:
+        cells = (len(self.keyframes), self.camera.height // 8, self.camera.width // 8)
+        if self.inverse_depth.shape != cells or self.confidence.shape != cells:
+            raise ValueError(
+                f"keyframe maps must be {cells}: {self.inverse_depth.shape = }, {self.confidence.shape = }"
+            )
+        if self.camera.width % 8 or self.camera.height % 8:
+            raise ValueError(f"the working size must be whole cells, got {self.camera.width} x {self.camera.height}")
+
+
+@dataclass(frozen=True, slots=True)
+class DepthFrame:
+    """Dense depth of one frame at source resolution.
+
+    Attributes:
+        index: Frame index.
+        rgb: (H, W, 3) uint8.
+        depth: (H, W) float32, finite and positive on every pixel, in units of the trajectory: z for pinhole, distance
+            for the other models.
+        confidence: (H, W) float32 in 0..1; 0 is a value that was filled in.
+    """
+
+    index: int
+    rgb: NDArray[np.uint8]
+    depth: NDArray[np.float32]
+    confidence: NDArray[np.float32]
