@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-import os
-
 import cv2
 import torch
 
 from vipe_core.errors import ConfigError
-
-_MAX_DEFAULT_THREADS = 4
 
 
 def resolve_device(name: str) -> torch.device:
@@ -36,27 +32,22 @@ def resolve_device(name: str) -> torch.device:
     return device
 
 
-def describe_device(device: torch.device) -> str:
-    """`cpu`, or the name of the GPU: results are reproducible on one and the same kind of device."""
-    return "cpu" if device.type == "cpu" else f"cuda ({torch.cuda.get_device_name(device)})"
+def describe_device(device: torch.device, threads: int) -> str:
+    """What results are reproducible on: `cpu` or the GPU's name, and the thread count where it is not one.
+
+    Optical flow is computed in one stripe per thread, and a stripe does not see its neighbour.
+    """
+    name = "cpu" if device.type == "cpu" else f"cuda ({torch.cuda.get_device_name(device)})"
+    return name if threads == 1 else f"{name}, {threads} threads"
 
 
-def set_threads(threads: int | None) -> int:
+def set_threads(threads: int) -> None:
     """Bound the threads of torch and OpenCV in this process.
-
-    Args:
-        threads: None takes what `OMP_NUM_THREADS` says, or else the available cores up to a few: more gain nothing on
-            working images of this size.
 
     Raises:
         ConfigError: `threads` is not positive.
     """
-    if threads is None:
-        stated = os.environ.get("OMP_NUM_THREADS", "")
-        available = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-        threads = int(stated) if stated.isdigit() and int(stated) > 0 else min(available, _MAX_DEFAULT_THREADS)
     if threads < 1:
         raise ConfigError(f"threads must be at least 1, got {threads}")
     torch.set_num_threads(threads)
     cv2.setNumThreads(threads)
-    return threads

@@ -7,6 +7,7 @@ import hashlib
 import json
 from dataclasses import dataclass, field
 
+from vipe_core.depth import DepthSettings
 from vipe_core.errors import ConfigError
 from vipe_core.slam.settings import SlamSettings
 
@@ -25,6 +26,7 @@ class Preset:
         intrinsics: Provider of the initial camera.
         depth: Provider of dense depth.
         slam: Settings of the SLAM stage.
+        dense_depth: Settings of the depth stage.
     """
 
     name: str
@@ -34,6 +36,7 @@ class Preset:
     intrinsics: str
     depth: str
     slam: SlamSettings = field(default_factory=SlamSettings)
+    dense_depth: DepthSettings = field(default_factory=DepthSettings)
 
     def canonical_json(self) -> str:
         """All fields, keys sorted, no white space: equal presets give equal text."""

@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 from vipe_core.ba.problem import Result
 from vipe_core.slam.adjustment import REFINE, Adjuster
 from vipe_core.slam.masks import moving_cells
+from vipe_core.slam.measuring import MeasuredGraph
 from vipe_core.slam.proximity import close_pairs, loop_edges
 from vipe_core.slam.reprojection import Reprojector
 from vipe_core.slam.settings import SlamSettings
-from vipe_core.slam.measuring import MeasuredGraph
 
 logger = logging.getLogger(__name__)
 
@@ -84,17 +84,13 @@ class Backend:
         )
         existing = sum(1 for i, j in self._measured.graph if i - j > self._settings.neighbours)
         for pair in loop_edges(pairs, self._measured.graph, limit - existing):
-            self._measured.connect(
-                pair.target, pair.source, guided=True, min_consistent=self._settings.min_consistent
-            )
+            self._measured.connect(pair.target, pair.source, guided=True, min_consistent=self._settings.min_consistent)
 
     def _adjust(self) -> Result | None:
         """Adjust with a free focal length under its prior; take it back when it runs out of any lens's range."""
         frames = range(len(self._keyframes))
         before = self._keyframes.snapshot()
-        result = self._adjuster.adjust(
-            self._keyframes, self._measured.graph, frames, (0,), REFINE, free_focal=True
-        )
+        result = self._adjuster.adjust(self._keyframes, self._measured.graph, frames, (0,), REFINE, free_focal=True)
         if result is None:
             return None
         prior_sigma = self._adjuster.focal_prior.sigma

@@ -18,7 +18,6 @@ import poselib
 from numpy.typing import NDArray
 
 from vipe_core.slam.adjustment import FROM_SCRATCH, REFINE, TRACK, Adjuster, Step
-from vipe_core.slam.keyframes import KeyframeMap
 from vipe_core.slam.measuring import MeasuredGraph
 from vipe_core.slam.reprojection import Reprojector, splat_inverse_depth
 from vipe_core.slam.selection import Keyframe
@@ -59,9 +58,7 @@ class Seed:
 class Bootstrap:
     """Builds the map of the first keyframes."""
 
-    def __init__(
-        self, measured: MeasuredGraph, adjuster: Adjuster, reprojector: Reprojector, neighbours: int
-    ) -> None:
+    def __init__(self, measured: MeasuredGraph, adjuster: Adjuster, reprojector: Reprojector, neighbours: int) -> None:
         self._measured = measured
         self._keyframes = measured.keyframes
         self._graph = measured.graph
@@ -140,9 +137,7 @@ class Bootstrap:
             relative = seed.second_from_first.copy()
             relative[:3, 3] *= scale
             keyframes.set_pose(seed.second, relative)
-            keyframes.set_depth(
-                seed.second, splat_inverse_depth(self._reprojector, keyframes, seed.first, seed.second)
-            )
+            keyframes.set_depth(seed.second, splat_inverse_depth(self._reprojector, keyframes, seed.first, seed.second))
         schedule = FROM_SCRATCH if seed.second_from_first is None else REFINE
         self._adjuster.adjust(keyframes, self._graph, placed, (seed.first,), schedule)
         while len(placed) < len(keyframes):
@@ -172,7 +167,7 @@ class Bootstrap:
     def _triangulate(self, seed: Seed) -> NDArray[np.float64]:
         """(P,) inverse depth of the first keyframe's cells, by least squares in the normalised second image.
 
-        With a = R ray and b = t the point a + b d is seen at (u, v) where (a_x + b_x d) = u (a_z + b_z d), and so for v:
+        With a = R ray and b = t the point a + b d is seen at (u, v) where a_x + b_x d = u (a_z + b_z d), and so for v:
         two linear equations in d. Cells that come out behind a camera take the median.
         """
         assert seed.second_from_first is not None

@@ -151,7 +151,9 @@ class Infill:
         inside = total = 0.0
         for k, match in frame.matches:
             induced = self._reprojector.induced(
-                self._keyframes.intrinsics, relative_pose(cam_from_world, self._keyframes.pose(k)), self._keyframes.depth(k)
+                self._keyframes.intrinsics,
+                relative_pose(cam_from_world, self._keyframes.pose(k)),
+                self._keyframes.depth(k),
             )
             weight = match.weight.mean(axis=1) * self._keyframes.static(k)
             weight = np.where(weight > _MIN_WEIGHT, weight, 0)

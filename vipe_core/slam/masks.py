@@ -30,8 +30,8 @@ def moving_cells(
     """(P,) bool, True on cells of keyframe `k` that appear to move by themselves.
 
     A cell moves when at least two edges measure it and most of them disagree with the reprojection by more than
-    `threshold_px`. Specks are dropped and the rest grows by a cell, because flow bleeds over borders. Should most of the
-    measured picture disagree, the geometry is wrong rather than the picture, and nothing is masked.
+    `threshold_px`. Specks are dropped and the rest grows by a cell, because flow bleeds over borders. Should most of
+    the measured picture disagree, the geometry is wrong rather than the picture, and nothing is masked.
     """
     grid = keyframes.grid
     measured = np.zeros(grid.num_cells, dtype=np.float32)

@@ -157,7 +157,9 @@ def select_keyframes(
         enough = len(motion.keyframes) >= min(settings.min_keyframes, len(times))
         if enough or motion.max_motion_px < static_px:
             break
-        threshold_px = max(0.5 * static_px, min(0.6 * threshold_px, motion.total_motion_px / (settings.min_keyframes + 2)))
+        threshold_px = max(
+            0.5 * static_px, min(0.6 * threshold_px, motion.total_motion_px / (settings.min_keyframes + 2))
+        )
         logger.debug("%d keyframes are few: threshold lowered to %.2f px", len(motion.keyframes), threshold_px)
         motion = _filter(again(), matcher, threshold_px)
     return Selection(np.array(times, dtype=np.float64), motion.keyframes, thinned.frames, motion.max_motion_px)

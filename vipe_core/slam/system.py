@@ -108,9 +108,7 @@ class Slam:
         backend = Backend(measured, adjuster, reprojector, self._settings, size.width)
         static = selection.max_motion_px < self._settings.scaled_px(self._settings.static_motion_px, size.width)
         chosen = selection.keyframes[:1] if static else selection.keyframes
-        tracker = Tracker(
-            measured, adjuster, reprojector, self._settings, self._settings.scaled_px(1.0, size.width)
-        )
+        tracker = Tracker(measured, adjuster, reprojector, self._settings, self._settings.scaled_px(1.0, size.width))
         with _timed(timings, "track"):
             times_s = [float(selection.timestamps_s[keyframe.index]) for keyframe in chosen]
             first = min(len(chosen), self._settings.min_keyframes)
@@ -133,9 +131,7 @@ class Slam:
                 frame_inliers = np.ones(selection.num_frames, dtype=np.float32)
                 report("infill", selection.num_frames, selection.num_frames)
             else:
-                infill = Infill(
-                    keyframes, self._priors.matcher, adjuster, reprojector, self._settings.infill_batch
-                )
+                infill = Infill(keyframes, self._priors.matcher, adjuster, reprojector, self._settings.infill_batch)
                 trajectory = infill.run(source, size, selection.timestamps_s, report)
                 cam_from_world, frame_inliers = trajectory.cam_from_world, trajectory.inlier_ratio
         world_from_cam = inverse(cam_from_world)
@@ -161,9 +157,7 @@ class Slam:
         focal_px = estimate.camera.focal_px / math.sqrt(scale_x * scale_y)
         width, height = source.info.width, source.info.height
         square = Camera("pinhole", (focal_px, focal_px, width / 2, height / 2), width, height)
-        return IntrinsicsEstimate(
-            square.resized(size.width, size.height), estimate.log_focal_sigma, estimate.num_pairs
-        )
+        return IntrinsicsEstimate(square.resized(size.width, size.height), estimate.log_focal_sigma, estimate.num_pairs)
 
 
 def _camera(intrinsics: NDArray[np.float64], size: WorkingSize) -> Camera:

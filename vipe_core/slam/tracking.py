@@ -21,7 +21,12 @@ class Tracker:
     """Grows a map that `Bootstrap` has started by one keyframe per call of `add`."""
 
     def __init__(
-        self, measured: MeasuredGraph, adjuster: Adjuster, reprojector: Reprojector, settings: SlamSettings, scale: float
+        self,
+        measured: MeasuredGraph,
+        adjuster: Adjuster,
+        reprojector: Reprojector,
+        settings: SlamSettings,
+        scale: float,
     ) -> None:
         self._measured = measured
         self._keyframes = measured.keyframes
@@ -54,7 +59,10 @@ class Tracker:
         before_s, now_s = self._keyframes.times_s[last - 1 : last + 1]
         reach_s = min(time_s, now_s + _MAX_VELOCITY_RATIO * (now_s - before_s))
         poses = np.stack([self._keyframes.pose(last - 1), self._keyframes.pose(last)])
-        return interpolate_trajectory([before_s, now_s], poses, [reach_s], extrapolate=True)[0]
+        predicted: NDArray[np.float64] = interpolate_trajectory([before_s, now_s], poses, [reach_s], extrapolate=True)[
+            0
+        ]
+        return predicted
 
     def _pose_from_previous(self, k: int) -> None:
         """Motion-only pose of the new keyframe against the depth of the one before, from the better of two starts."""
