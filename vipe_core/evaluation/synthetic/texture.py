@@ -57,8 +57,8 @@ def _noise3(x: float, y: float, z: float, seed: int) -> float:
 
 @compiled
 def _fade(cell: float, foot: float) -> float:
-    """How much of a feature of size `cell` survives the footprint: 0 below 1.5 pixels, 1 above 3."""
-    return min(1.0, max(0.0, (cell / foot - 1.5) / 1.5))
+    """How much of a feature of size `cell` survives the footprint: 0 below one pixel, 1 above 2.2."""
+    return min(1.0, max(0.0, (cell / foot - 1.0) / 1.2))
 
 
 @compiled
