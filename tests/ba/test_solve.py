@@ -257,3 +257,17 @@ def test_induced_flow_of_an_unmoved_camera_is_zero() -> None:
     px, valid = reproject("mei", problem.grid, truth, torch.tensor([2]), torch.tensor([2]))
     assert valid.all()
     torch.testing.assert_close(px[0], problem.grid.sample_px())
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU on this machine")
+@pytest.mark.parametrize("camera_model", ["pinhole", "mei"])
+def test_gpu_gives_the_same_answer(camera_model: CameraModel) -> None:
+    problem, truth = scene(camera_model, distortion_free=camera_model == "mei")
+    problem, start = with_noise(problem, 0.1), disturbed(truth)
+    host = solve(problem, start)
+    device = solve(problem, State(*(x.cuda() for x in (start.cam_from_world, start.inverse_depth, start.intrinsics))))
+    assert device.state.cam_from_world.is_cuda
+    assert device.status is host.status
+    torch.testing.assert_close(device.state.cam_from_world.cpu(), host.state.cam_from_world, rtol=0, atol=1e-8)
+    torch.testing.assert_close(device.state.inverse_depth.cpu(), host.state.inverse_depth, rtol=1e-7, atol=0)
+    torch.testing.assert_close(device.state.intrinsics.cpu(), host.state.intrinsics, rtol=1e-8, atol=0)

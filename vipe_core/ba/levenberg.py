@@ -13,12 +13,15 @@ from torch import Tensor
 
 from vipe_core.ba import robust
 from vipe_core.ba.plan import build_plan
-from vipe_core.ba.problem import Options, Problem, Result, State, Status
+from vipe_core.ba.problem import Edges, Options, Problem, Result, State, Status
 from vipe_core.ba.reprojection import require_supported
 from vipe_core.ba.torch_solver import Cost, Step, TorchSolver
 
 _MAX_DAMPING = 1e8
-_MIN_DAMPING = 1e-10
+# Single precision leaves errors of this size in the reduced system: less damping only makes it indefinite.
+_MIN_DAMPING = {torch.float32: 1e-7, torch.float64: 1e-10}
+# A free gauge does not couple with the focal length, so the least damping that makes the system invertible will do.
+_SIGMA_DAMPINGS = (1e-9, 1e-7, 1e-5)
 _ACCEPTED_FACTOR = 0.2
 _REJECTED_FACTOR = 10.0
 # Mean squared residual, px^2, at which exact data is solved and only rounding is left.
@@ -45,7 +48,7 @@ def solve(problem: Problem, state: State, options: Options | None = None) -> Res
         ValueError: Inverse depths that are neither float32 nor float64.
     """
     options = options or Options()
-    problem = _on_device(problem, state)
+    problem, state = _on_device(problem, state)
     if not _finite(problem, state):
         return Result(state, Status.NON_FINITE, 0, math.nan, math.nan, 0.0)
     plan = build_plan(problem, state.inverse_depth.device)
@@ -62,7 +65,7 @@ def solve(problem: Problem, state: State, options: Options | None = None) -> Res
     total = cost.total(lost_rho)
     system = solver.linearise(state)
     linearised_state = state
-    damping = options.initial_damping
+    damping, min_damping = options.initial_damping, _MIN_DAMPING[state.inverse_depth.dtype]
     status = Status.MAX_ITERATIONS
     iterations = 0
     while iterations < options.max_iterations:
@@ -76,7 +79,7 @@ def solve(problem: Problem, state: State, options: Options | None = None) -> Res
         )
         if factorised and new < old:
             state, cost, total = new_state, new_cost, new_total
-            damping = max(damping * _ACCEPTED_FACTOR, _MIN_DAMPING)
+            damping = max(damping * _ACCEPTED_FACTOR, min_damping)
             if old - new < options.relative_tolerance * old or mean < _NEGLIGIBLE_COST:
                 status = Status.CONVERGED
                 break
@@ -86,7 +89,7 @@ def solve(problem: Problem, state: State, options: Options | None = None) -> Res
             if factorised and predicted < options.relative_tolerance * old:
                 status = Status.CONVERGED
                 break
-            damping = max(damping * _REJECTED_FACTOR, _MIN_DAMPING)
+            damping = max(damping * _REJECTED_FACTOR, min_damping)
             if damping > _MAX_DAMPING:
                 status = Status.NO_PROGRESS if factorised else Status.SINGULAR
                 break
@@ -95,7 +98,8 @@ def solve(problem: Problem, state: State, options: Options | None = None) -> Res
     if plan.focal_column is not None:
         if linearised_state is not state:
             system = solver.linearise(state)
-        variance = float(solver.log_focal_variance(system))
+        variances = _read(*(solver.log_focal_variance(system, damping) for damping in _SIGMA_DAMPINGS))
+        variance = next((value for value in variances if value > 0), math.nan)
     measured, weight = _read(cost.measurements, cost.weight)
     sigma = math.sqrt(variance) if variance > 0 else math.nan
     return Result(state, status, iterations, initial_cost, measured, weight, sigma)
@@ -108,41 +112,40 @@ def newton_step(problem: Problem, state: State, options: Options | None = None, 
         ConfigError: A camera model without derivatives here.
     """
     options = options or Options()
-    problem = _on_device(problem, state)
+    problem, state = _on_device(problem, state)
     solver = TorchSolver(problem, build_plan(problem, state.inverse_depth.device), options, state)
     return solver.step(solver.linearise(state), damping)
 
 
-def _on_device(problem: Problem, state: State) -> Problem:
+def _on_device(problem: Problem, state: State) -> tuple[Problem, State]:
+    """All tensors where the inverse depths are."""
     require_supported(problem.camera_model)
     if state.inverse_depth.dtype not in (torch.float32, torch.float64):
         raise ValueError(f"inverse depths must be float32 or float64, got {state.inverse_depth.dtype}")
     device = state.inverse_depth.device
+    if state.cam_from_world.device != device or state.intrinsics.device != device:
+        state = State(state.cam_from_world.to(device), state.inverse_depth, state.intrinsics.to(device))
     edges, priors = problem.edges, problem.priors
-    return replace(
-        problem,
-        edges=replace(edges, target_px=edges.target_px.to(device), weight=edges.weight.to(device)),
-        priors=replace(
+    if priors.inverse_depth is not None and priors.inverse_depth_weight is not None:
+        priors = replace(
             priors,
-            inverse_depth=None if priors.inverse_depth is None else priors.inverse_depth.to(device),
-            inverse_depth_weight=(
-                None if priors.inverse_depth_weight is None else priors.inverse_depth_weight.to(device)
-            ),
-        ),
-    )
+            inverse_depth=priors.inverse_depth.to(device),
+            inverse_depth_weight=priors.inverse_depth_weight.to(device),
+        )
+    edges = Edges(edges.source.to(device), edges.target.to(device), edges.target_px.to(device), edges.weight.to(device))
+    return replace(problem, edges=edges, priors=priors), state
 
 
 def _finite(problem: Problem, state: State) -> bool:
     """Whether every number that takes part is finite. A measurement without weight takes no part."""
     edges, priors = problem.edges, problem.priors
-    device = state.inverse_depth.device
     checks = [tensor.isfinite().all() for tensor in (state.cam_from_world, state.inverse_depth, state.intrinsics)]
     checks.append(edges.weight.isfinite().all())
     checks.append((edges.target_px.isfinite() | (edges.weight <= 0)).all())
     if priors.inverse_depth is not None and priors.inverse_depth_weight is not None:
         checks.append(priors.inverse_depth_weight.isfinite().all())
         checks.append((priors.inverse_depth.isfinite() | (priors.inverse_depth_weight <= 0)).all())
-    return bool(torch.stack([check.to(device) for check in checks]).all())
+    return bool(torch.stack(checks).all())
 
 
 def _lost_rho(options: Options, cost: Cost) -> Tensor:

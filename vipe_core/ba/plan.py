@@ -1,6 +1,7 @@
 """The shape of a bundle adjustment, worked out once per graph: order of edges, chunks of source frames, columns.
 
-Everything behind one inverse depth is seen by the edges that leave its frame, so the work is grouped by source frame.
+Everything behind one inverse depth is seen by the edges that leave its frame, so the work is grouped by source frame
+(edges of a frame whose depths are fixed may be summed apart).
 Frames of similar out-degree share a chunk, padded to the largest one; a chunk is what one batch of tensor operations
 works on, sized for the cache of a CPU or for the occupancy of a GPU. Edges are ordered by (source, target), so a solve
 does not depend on the order they came in.
@@ -11,7 +12,9 @@ the right-hand side, then one dump column that collects everything fixed and is 
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -28,7 +31,7 @@ class Chunk:
     """F source frames with D edges each (padded).
 
     Attributes:
-        frames: (F,) int64 source frames.
+        frames: (F,) int64 source frames, different ones where depths are free.
         edges: (F, D) int64 indices into the problem's edges; 0 where padded.
         targets: (F, D) int64 target frames; the source itself where padded.
         real: (F, D) bool, False where padded.
@@ -70,6 +73,23 @@ class Plan:
     any_depth_free: bool
 
 
+class _Group(NamedTuple):
+    """Edges of one source frame that are summed together; sorts by what can share a chunk."""
+
+    depth_free: bool
+    size: int
+    frame: int
+    offset: int
+
+
+def _groups(depth_free: Tensor, degree: Tensor, limit: int) -> Iterator[_Group]:
+    """All edges of a frame whose depths are eliminated; pieces of at most `limit` edges of a frame whose are not."""
+    for frame, (free, count) in enumerate(zip(depth_free.tolist(), degree.tolist(), strict=True)):
+        piece = count if free else limit
+        for offset in range(0, count, max(piece, 1)):
+            yield _Group(free, min(piece, count - offset), frame, offset)
+
+
 def build_plan(problem: Problem, device: torch.device) -> Plan:
     """Lay out a problem. Host work, linear in edges and frames; the plan's tensors end on `device`."""
     free_poses = problem.free.poses.cpu()
@@ -97,28 +117,25 @@ def build_plan(problem: Problem, device: torch.device) -> Plan:
     order = torch.argsort(source * num_frames + target, stable=True)
     degree = torch.bincount(source, minlength=num_frames)
     first = torch.cumsum(degree, 0) - degree
-    by_shape = sorted(
-        (frame for frame in range(num_frames) if degree[frame] > 0),
-        key=lambda frame: (bool(depth_free[frame]), int(degree[frame]), frame),
-    )
     limit = (_CPU_CHUNK_CELLS if device.type == "cpu" else _GPU_CHUNK_CELLS) // max(problem.grid.num_cells, 1)
+    groups = sorted(_groups(depth_free, degree, max(limit, 1)))
 
     chunks: list[Chunk] = []
     start = 0
-    while start < len(by_shape):
+    while start < len(groups):
         stop = start + 1
-        # Sorted by degree, so the last one sets the padding.
+        # Sorted by size, so the last one sets the padding.
         while (
-            stop < len(by_shape)
-            and depth_free[by_shape[stop]] == depth_free[by_shape[start]]
-            and (stop + 1 - start) * int(degree[by_shape[stop]]) <= limit
+            stop < len(groups)
+            and groups[stop].depth_free == groups[start].depth_free
+            and (stop + 1 - start) * groups[stop].size <= limit
         ):
             stop += 1
-        frames = torch.tensor(by_shape[start:stop])
-        width = int(degree[frames[-1]])
-        slots = torch.arange(width)
-        real = slots < degree[frames, None]
-        edges = torch.where(real, order[(first[frames, None] + slots).clamp_max(len(order) - 1)], 0)
+        frames, offset, size = torch.tensor([(g.frame, g.offset, g.size) for g in groups[start:stop]]).T
+        slots = torch.arange(int(size[-1]))
+        real = slots < size[:, None]
+        position = (first[frames] + offset)[:, None] + slots
+        edges = torch.where(real, order[position.clamp_max(len(order) - 1)], 0)
         targets = torch.where(real, target[edges], frames[:, None])
         columns = torch.cat(
             (
@@ -135,7 +152,7 @@ def build_plan(problem: Problem, device: torch.device) -> Plan:
                 targets.to(device),
                 real.to(device),
                 columns.to(device),
-                bool(depth_free[frames[0]]),
+                groups[start].depth_free,
             )
         )
         start = stop

@@ -89,5 +89,5 @@ def residuals(problem: Problem, state: State, min_depth_ratio: float = _MIN_DEPT
     """
     edges = problem.edges
     px, projected = reproject(problem.camera_model, problem.grid, state, edges.source, edges.target, min_depth_ratio)
-    valid = projected & (edges.weight > 0).any(-1)
-    return torch.where(valid[..., None], px - edges.target_px.to(px.dtype), 0), valid
+    valid = projected & (edges.weight.to(px.device) > 0).any(-1)
+    return torch.where(valid[..., None], px - edges.target_px.to(px), 0), valid

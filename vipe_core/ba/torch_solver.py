@@ -129,7 +129,6 @@ class _View:
     valid: Tensor
     weighted: Tensor
     squared: Tensor
-    adjoint: Tensor
 
 
 @dataclass(frozen=True, slots=True)
@@ -156,11 +155,16 @@ class Linearisation:
     factors: Callable[[], Iterable[tuple[Chunk, _Eliminated]]]
 
 
-class _Optics:
-    """Everything that depends on the intrinsics only."""
+class _Geometry:
+    """What depends on poses and intrinsics only: transforms per edge, rays per cell."""
 
-    def __init__(self, problem: Problem, options: Options, intrinsics: Tensor, sample_px: Tensor, dtype: torch.dtype):
-        model = problem.camera_model
+    def __init__(self, problem: Problem, options: Options, state: State, sample_px: Tensor) -> None:
+        model, dtype, intrinsics = problem.camera_model, state.inverse_depth.dtype, state.intrinsics
+        source_from_world = state.cam_from_world[problem.edges.source]
+        transform = se3.relative(state.cam_from_world[problem.edges.target], source_from_world)
+        self.adjoint = se3.adjoint(transform)
+        self.rotation = transform[:, :3, :3].to(dtype)
+        self.translation = transform[:, :3, 3:].to(dtype)
         rays = projection.unproject(model, intrinsics, sample_px)
         self.rays = rays.mT.to(dtype).contiguous()
         by_intrinsics = projection.unproject_jacobian(model, intrinsics, sample_px)
@@ -202,40 +206,36 @@ class TorchSolver:
                 self._measured[index] = found
         return found
 
-    def _optics(self, state: State) -> _Optics:
-        return _Optics(self.problem, self.options, state.intrinsics, self._sample_px, self.dtype)
+    def _geometry(self, state: State) -> _Geometry:
+        return _Geometry(self.problem, self.options, state, self._sample_px)
 
-    def _view(self, chunk: Chunk, measured: _Measured, state: State, optics: _Optics) -> _View:
-        source_from_world = state.cam_from_world[chunk.frames][:, None]
-        transform = se3.relative(state.cam_from_world[chunk.targets], source_from_world)
-        rotation = transform[..., :3, :3].to(self.dtype)
-        translation = transform[..., :3, 3:].to(self.dtype)
-        points = rotation @ optics.rays
+    def _view(self, chunk: Chunk, measured: _Measured, state: State, geometry: _Geometry) -> _View:
+        rotation, translation = geometry.rotation[chunk.edges], geometry.translation[chunk.edges]
+        points = rotation @ geometry.rays
         points.addcmul_(translation, state.inverse_depth[chunk.frames][:, None, None])
         s, norm = points[:, :, 2:], None
-        valid = s[:, :, 0] > optics.min_s
-        if optics.alpha is not None:
+        valid = s[:, :, 0] > geometry.min_s
+        if geometry.alpha is not None:
             norm = (points * points).sum(2, keepdim=True).sqrt()
-            s = s + optics.alpha * norm
-            beyond = (optics.alpha > 1) & (optics.alpha * points[:, :, 2] <= -norm[:, :, 0])
-            valid = (s[:, :, 0] > optics.min_s) & ~beyond
+            s = s + geometry.alpha * norm
+            beyond = (geometry.alpha > 1) & (geometry.alpha * points[:, :, 2] <= -norm[:, :, 0])
+            valid = (s[:, :, 0] > geometry.min_s) & ~beyond
             norm = torch.where(valid[:, :, None], norm, 1)
         s = torch.where(valid[:, :, None], s, 1)
         xy = points[:, :, :2] / s
-        error = torch.addcmul(optics.centre - measured.target_px, xy, optics.focal)
+        error = torch.addcmul(geometry.centre - measured.target_px, xy, geometry.focal)
         weighted = error.mul_(measured.root_weight).mul_(valid[:, :, None])
         squared = (weighted * weighted).sum(2).div_(measured.max_weight.clamp_min(torch.finfo(self.dtype).tiny))
-        adjoint = se3.adjoint(transform)
-        return _View(points, rotation, translation, s, norm, xy, valid, weighted, squared, adjoint)
+        return _View(points, rotation, translation, s, norm, xy, valid, weighted, squared)
 
     def cost(self, state: State) -> Cost:
         """The robust cost at a state."""
-        optics = self._optics(state)
+        geometry = self._geometry(state)
         options = self.options
         total = torch.zeros(4, dtype=torch.float64, device=self.device)
         for index, chunk in enumerate(self.plan.chunks):
             measured = self._measure(index, chunk)
-            view = self._view(chunk, measured, state, optics)
+            view = self._view(chunk, measured, state, geometry)
             rho = robust.cost(options.robust, options.robust_scale_px, view.squared)
             kept_weight = measured.max_weight * view.valid
             total[0] += (rho * kept_weight).sum(-1).double().sum()
@@ -261,12 +261,12 @@ class TorchSolver:
     # -- normal equations ----------------------------------------------------------------------------------------
 
     def _rows(
-        self, chunk: Chunk, view: _View, measured: _Measured, state: State, optics: _Optics
+        self, chunk: Chunk, view: _View, measured: _Measured, state: State, geometry: _Geometry
     ) -> tuple[Tensor, Tensor]:
-        """Scaled Jacobian rows of tau and intrinsics, then the negative residual; and the row of the depth.
+        """Scaled Jacobian rows of tau and intrinsics, then the negative residual; and the scaled J_X.
 
         Returns:
-            (F, D, 6 + n + 1, 2, P) and (F, D, 2, P).
+            (F, D, 6 + n + 1, 2, P) and (F, D, 3, 2, P).
         """
         scale = measured.root_weight * view.valid[:, :, None]
         residual = view.weighted
@@ -275,16 +275,22 @@ class TorchSolver:
             scale = scale * slope[:, :, None]
             residual = residual * slope[:, :, None]
         # J_X = scale f / s (1 - xy slope^T), slope = e_z + alpha X / |X|.
-        diagonal = scale * optics.focal / view.s
+        diagonal = scale * geometry.focal / view.s
         outer = -diagonal * view.xy
         frames, degree, _, cells = view.points.shape
-        by_point = torch.zeros(frames, degree, 3, 2, cells, dtype=self.dtype, device=self.device)
-        by_point[:, :, 2] = outer
-        if optics.alpha is not None and view.norm is not None:
-            bend = optics.alpha * view.points / view.norm
-            by_point.addcmul_(bend[:, :, :, None], outer[:, :, None])
-        by_point[:, :, 0, 0] += diagonal[:, :, 0]
-        by_point[:, :, 1, 1] += diagonal[:, :, 1]
+        by_point = torch.empty(frames, degree, 3, 2, cells, dtype=self.dtype, device=self.device)
+        if geometry.alpha is not None and view.norm is not None:
+            bend = geometry.alpha * view.points / view.norm
+            torch.mul(bend[:, :, :, None], outer[:, :, None], out=by_point)
+            by_point[:, :, 2] += outer
+            by_point[:, :, 0, 0] += diagonal[:, :, 0]
+            by_point[:, :, 1, 1] += diagonal[:, :, 1]
+        else:
+            by_point[:, :, 0, 0] = diagonal[:, :, 0]
+            by_point[:, :, 0, 1] = 0
+            by_point[:, :, 1, 0] = 0
+            by_point[:, :, 1, 1] = diagonal[:, :, 1]
+            by_point[:, :, 2] = outer
 
         num_rows = 7 + len(self._free_intrinsics)
         rows = torch.empty(frames, degree, num_rows, 2, cells, dtype=self.dtype, device=self.device)
@@ -295,17 +301,20 @@ class TorchSolver:
             torch.mul(by_point[:, :, b], view.points[:, :, a, None], out=row)
             row.addcmul_(by_point[:, :, a], view.points[:, :, b, None], value=-1)
         for row_index, intrinsic in enumerate(self._free_intrinsics):
-            ray = view.rotation @ optics.rays_by_intrinsics[intrinsic]
+            ray = view.rotation @ geometry.rays_by_intrinsics[intrinsic]
             row = rows[:, :, 6 + row_index]
             torch.sum(by_point * ray[:, :, :, None], dim=2, out=row)
             # Both camera derivatives are multiples of xy f: s outer = -scale f xy.
             row.addcmul_(outer, view.s if intrinsic == 0 or view.norm is None else -view.norm, value=-1)
         torch.neg(residual, out=rows[:, :, -1])
-        by_depth = (view.translation.mT @ by_point.flatten(3)).view(frames, degree, 2, cells)
-        return rows, by_depth
+        return rows, by_point
 
-    def _eliminate(self, chunk: Chunk, view: _View, rows: Tensor, by_depth: Tensor, state: State) -> _Eliminated:
+    def _eliminate(
+        self, chunk: Chunk, rows: Tensor, by_point: Tensor, geometry: _Geometry, state: State
+    ) -> _Eliminated:
         frames, degree, num_rows, _, cells = rows.shape
+        translation = geometry.translation[chunk.edges]
+        by_depth = (translation.mT @ by_point.flatten(3)).view(frames, degree, 2, cells)
         tail = num_rows - 6
         x = torch.empty(frames, 6 * degree + tail, cells, dtype=self.dtype, device=self.device)
         first, second = by_depth[:, :, None, 0], by_depth[:, :, None, 1]
@@ -323,28 +332,29 @@ class TorchSolver:
         seen = curvature > torch.finfo(self.dtype).tiny
         root_q = torch.where(seen, curvature, 1).rsqrt().mul_(seen)
         x.mul_(root_q[:, None])
-        return _Eliminated(x, root_q, view.adjoint)
+        return _Eliminated(x, root_q, geometry.adjoint[chunk.edges])
 
     def linearise(self, state: State) -> Linearisation:
         """The normal equations at a state."""
-        optics = self._optics(state)
+        geometry = self._geometry(state)
         size = self.plan.num_columns + 2
         direct = torch.zeros(size, size, dtype=torch.float64, device=self.device)
         eliminated = torch.zeros_like(direct)
         kept: list[tuple[Chunk, _Eliminated]] = []
 
-        def rows_of(index: int, chunk: Chunk) -> tuple[_View, Tensor, Tensor]:
+        def rows_of(index: int, chunk: Chunk) -> tuple[Tensor, Tensor]:
             measured = self._measure(index, chunk)
-            view = self._view(chunk, measured, state, optics)
-            return view, *self._rows(chunk, view, measured, state, optics)
+            view = self._view(chunk, measured, state, geometry)
+            return self._rows(chunk, view, measured, state, geometry)
 
         for index, chunk in enumerate(self.plan.chunks):
-            view, rows, by_depth = rows_of(index, chunk)
+            rows, by_point = rows_of(index, chunk)
             flat = rows.flatten(3)
-            _scatter(direct, chunk, _border(flat @ flat.mT), view.adjoint)
+            adjoint = geometry.adjoint[chunk.edges]
+            _scatter(direct, chunk, _border(flat @ flat.mT), adjoint)
             if chunk.depth_free:
-                factor = self._eliminate(chunk, view, rows, by_depth, state)
-                _scatter(eliminated, chunk, (factor.x @ factor.x.mT).double(), view.adjoint)
+                factor = self._eliminate(chunk, rows, by_point, geometry, state)
+                _scatter(eliminated, chunk, (factor.x @ factor.x.mT).double(), adjoint)
                 if self._keep:
                     kept.append((chunk, factor))
 
@@ -354,7 +364,7 @@ class TorchSolver:
                 return
             for index, chunk in enumerate(self.plan.chunks):
                 if chunk.depth_free:
-                    yield chunk, self._eliminate(chunk, *rows_of(index, chunk), state)
+                    yield chunk, self._eliminate(chunk, *rows_of(index, chunk), geometry, state)
 
         priors, column = self.problem.priors, self.plan.focal_column
         if priors.log_focal is not None and column is not None:
@@ -424,12 +434,11 @@ class TorchSolver:
                 inverse_depth[chunk.frames] = moved.clamp(*self._depth_range)
         return State(se3.exp(step.pose) @ state.cam_from_world, inverse_depth, intrinsics)
 
-    def log_focal_variance(self, system: Linearisation) -> Tensor:
-        """Variance of log f with everything else marginalised; NaN where the system is singular. 0-dim."""
+    def log_focal_variance(self, system: Linearisation, damping: float) -> Tensor:
+        """Variance of log f with everything else marginalised; NaN where the damped system is singular. 0-dim."""
         column = self.plan.focal_column
         assert column is not None
-        # A free scale or gauge does not couple with f: the smallest damping makes it invertible and changes nothing.
-        scale, factor, _, factorised = self._factorise(system, 1e-9)
+        scale, factor, _, factorised = self._factorise(system, damping)
         unit = torch.zeros_like(scale)
         unit[column] = scale[column]
         variance = scale[column] * torch.cholesky_solve(unit[:, None], factor)[column, 0]
