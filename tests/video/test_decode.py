@@ -14,8 +14,8 @@ from hypothesis import strategies as st
 from video_clips import number_of, picture, set_display_rotation, write_clip
 
 from vipe_core.errors import UnsupportedMedia
-from vipe_core.video import VideoFileSource, open_source, probe
-from vipe_core.video.av_decode import Clock
+from vipe_core.video import Limits, VideoFileSource, open_source, probe
+from vipe_core.video.av_decode import Clock, Damage, EntryLog, decode
 
 
 def test_every_frame_arrives_once_in_order_with_its_time(tmp_path: Path) -> None:
@@ -237,3 +237,45 @@ def test_missing_repeated_and_reset_times() -> None:
     clock = Clock(0.1)
     repaired = [clock.repaired(value) for value in (None, 0.1, None, 0.2, 0.3, 10.0, 0.0, 0.1)]
     assert repaired == pytest.approx([0.0, 0.1, 0.2, 0.25, 0.3, 10.0, 10.1, 10.2])
+
+
+ENTRY_CLIPS = {
+    "closed.mp4": ("libx264", {"g": "12", "bf": "3"}),
+    "open.mp4": ("libx264", {"x264-params": "open-gop=1:bframes=3:keyint=12:scenecut=0"}),
+    "open.mkv": ("libx264", {"x264-params": "open-gop=1:bframes=3:keyint=12:scenecut=0"}),
+    "refresh.mp4": ("libx264", {"x264-params": "intra-refresh=1:keyint=12"}),
+    "hevc.mp4": ("libx265", {"x265-params": "log-level=none:keyint=12:bframes=3"}),
+    "vp9.mkv": ("libvpx-vp9", {"g": "12", "lag-in-frames": "8"}),
+    "stream.ts": ("libx264", {"g": "12"}),
+}
+
+
+@pytest.mark.parametrize("name", ENTRY_CLIPS)
+def test_beginning_at_a_key_picture_gives_the_same_frames_as_beginning_at_zero(tmp_path: Path, name: str) -> None:
+    codec, options = ENTRY_CLIPS[name]
+    source = VideoFileSource(write_clip(tmp_path / name, 40, codec=codec, options=options))
+    whole = list(source.frames())
+    assert len(whole) == 40
+    for start, stop in ((12, 13), (23, 27), (38, None)):
+        part = list(source.frames(start=start, stop=stop))
+        assert [(f.index, f.timestamp_s) for f in part] == [(f.index, f.timestamp_s) for f in whole[start:stop]]
+        assert all(np.array_equal(a.rgb, b.rgb) for a, b in zip(part, whole[start:stop], strict=True))
+
+
+def test_a_wrong_entry_falls_back_to_zero(tmp_path: Path) -> None:
+    path = write_clip(tmp_path / "c.mp4", 30, options={"g": "10"})
+    log = EntryLog()
+    whole = [(i, t) for i, t, _ in decode(str(path), Limits(), 1, Damage(), lambda: None, log=log)]
+    assert [index for index, _ in log.thinned(100)] == [10, 20]
+    for index, pts in log.thinned(100):
+        right = decode(str(path), Limits(), 1, Damage(), lambda: None, entry=(index, pts))
+        assert [(i, t) for i, t, _ in right] == whole[index:]
+        wrong = decode(str(path), Limits(), 1, Damage(), lambda: None, entry=(index, pts + 1))
+        assert [(i, t) for i, t, _ in wrong] == whole
+
+
+def test_entries_are_not_offered_where_the_container_has_no_index(tmp_path: Path) -> None:
+    log = EntryLog()
+    path = write_clip(tmp_path / "c.ts", 30, options={"g": "10"})
+    assert len(list(decode(str(path), Limits(), 1, Damage(), lambda: None, log=log))) == 30
+    assert log.thinned(100) == []

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from vipe_core.errors import CorruptMedia
+from vipe_core.errors import CorruptMedia, MediaNotFound
 from vipe_core.video.limits import Limits
 
 
@@ -18,10 +18,14 @@ def read_image(path: str, limits: Limits) -> NDArray[np.uint8]:
 
     Raises:
         CorruptMedia: The file cannot be decoded; names it.
+        MediaNotFound: It is gone, or may not be read.
         MediaTooLarge: The picture exceeds `limits`.
     """
     label = Path(path).name
-    data = np.fromfile(path, dtype=np.uint8)
+    try:
+        data = np.fromfile(path, dtype=np.uint8)
+    except OSError as error:
+        raise MediaNotFound(f"{label}: {error.strerror or 'cannot be read'}; check the path") from error
     try:
         bgr = cv2.imdecode(data, cv2.IMREAD_COLOR) if len(data) else None
     except cv2.error:

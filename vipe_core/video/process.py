@@ -69,8 +69,8 @@ class DecoderProcess:
             finally:
                 os.close(write_fd)
             resources.callback(self._kill)
-            with contextlib.suppress(OSError):
-                # A larger pipe means fewer switches; an unprivileged user may have used up the allowance.
+            with contextlib.suppress(OSError, AttributeError):
+                # A larger pipe means fewer switches; only Linux knows it, and the user's allowance may be used up.
                 fcntl.fcntl(self._fd, fcntl.F_SETPIPE_SZ, _PIPE_BYTES)
             os.set_blocking(self._fd, False)
             self._selector = resources.enter_context(selectors.DefaultSelector())

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import bisect
 import logging
 import os
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 from vipe_core.video.limits import Limits
-from vipe_core.video.probe import PROBE_BUDGET_S, probe
+from vipe_core.video.probe import PROBE_BUDGET_S, file_size_bytes, probe
 from vipe_core.video.process import DecoderProcess
 from vipe_core.video.source import Frame, VideoInfo
 from vipe_core.video.wire import Request
@@ -28,7 +30,9 @@ class VideoFileSource:
 
     Every iterator owns one child process; it ends when the iterator is exhausted, closed or garbage collected. A range
     that does not start at 0 decodes and discards what lies before, because only that numbers frames exactly in every
-    container. A file that is damaged or cut short gives the pictures that are whole, and says so in `damage`.
+    container; once a pass over the whole clip has found key pictures from which decoding is exact, it begins at the
+    last one before the range. A file that is damaged or cut short gives the pictures that are whole, and says so in
+    `damage`.
 
     Args:
         path: Video file.
@@ -56,6 +60,7 @@ class VideoFileSource:
         self._path = Path(path).absolute()
         self._info = probe(path, limits=self._limits, name=name, budget_s=max(stall_s, PROBE_BUDGET_S))
         self._damage: str | None = None
+        self._entries: list[tuple[int, int]] = []
 
     @property
     def info(self) -> VideoInfo:
@@ -71,6 +76,7 @@ class VideoFileSource:
         check_range(size, start, stop)
         if stop is not None and stop <= start:
             return
+        file_size_bytes(self._path)
         request = Request(
             task="decode",
             root=str(self._path.parent),
@@ -80,6 +86,7 @@ class VideoFileSource:
             size=size,
             start=start,
             stop=stop,
+            entry=self._entry_before(start),
             fps=self._info.fps,
             threads=self._threads,
             stall_s=self._stall_s,
@@ -88,9 +95,21 @@ class VideoFileSource:
             for item in child.frames():
                 if isinstance(item, Frame):
                     yield item
-                elif item.get("damage") and self._damage is None:
-                    self._damage = str(item["damage"])
-                    _LOG.warning("%s: %s; the whole pictures are used", self._path.name, self._damage)
+                else:
+                    self._note_end(item)
+
+    def _entry_before(self, index: int) -> tuple[int, int] | None:
+        position = bisect.bisect_right(self._entries, index, key=lambda entry: entry[0])
+        return self._entries[position - 1] if position else None
+
+    def _note_end(self, document: dict[str, Any]) -> None:
+        damage = document.get("damage")
+        if damage and self._damage is None:
+            self._damage = str(damage)
+            _LOG.warning("%s: %s; the whole pictures are used", self._path.name, self._damage)
+        entries = document.get("entries")
+        if entries:
+            self._entries = [(int(index), int(pts)) for index, pts in entries]
 
 
 def check_range(size: tuple[int, int] | None, start: int, stop: int | None) -> None:
