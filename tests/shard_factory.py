@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import json
 import zipfile
 from collections.abc import Sequence
 from datetime import UTC, datetime
@@ -31,8 +32,17 @@ def poses_of(num_frames: int) -> np.ndarray:
     return poses
 
 
-def write_artifacts(root: Path, key: str, num_frames: int = 3) -> None:
+def write_artifacts(root: Path, key: str, num_frames: int = 3, *, info: bool = False) -> None:
     """One video in ViPE's artifact layout (reference facts, section 2), without the project's own writer."""
+    if info:
+        description = {
+            "num_frames": num_frames,
+            "timestamps_s": [i / 10 for i in range(num_frames)],
+            "width": WIDTH,
+            "height": HEIGHT,
+        }
+        (root / "vipe").mkdir(parents=True, exist_ok=True)
+        (root / "vipe" / f"{key}_info.json").write_text(json.dumps(description))
     for folder in ("pose", "intrinsics", "depth", "rgb"):
         (root / folder).mkdir(parents=True, exist_ok=True)
     inds = np.arange(num_frames, dtype=np.int64)

@@ -16,6 +16,7 @@ from __future__ import annotations
 import hashlib
 import json
 import logging
+import re
 import shutil
 import tempfile
 import time
@@ -37,6 +38,7 @@ logger = logging.getLogger(__name__)
 
 DEFAULT_PREFIX = "vipe"
 _NAME_TRIES = 64
+_KEY = re.compile(r"[A-Za-z0-9_-]+")
 
 
 @dataclass(frozen=True, slots=True)
@@ -236,6 +238,8 @@ def _settled(lease: Lease, results: Sequence[VideoResult]) -> tuple[VideoResult,
     planned = [v.key for v in lease.videos]
     if len(by_key) != len(results) or set(by_key) != set(planned) or len(set(planned)) != len(planned):
         raise IntegrityError(f"shard {lease.shard_id} needs exactly one result for each of its {len(planned)} videos")
+    if bad_keys := [key for key in planned if not _KEY.fullmatch(key)]:
+        raise IntegrityError(f"shard {lease.shard_id} has keys that webdataset would split: {', '.join(bad_keys)}")
     if open_keys := [r.key for r in results if r.status is VideoStatus.PENDING]:
         raise IntegrityError(f"shard {lease.shard_id} has videos without an outcome: {', '.join(open_keys)}")
     return tuple(by_key[key] for key in planned)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from services.storage.base import ObjectInfo, ObjectStore
 from services.storage.directory import DirectoryStore
+from services.storage.object_file import open_object
 from services.storage.observer import StorageObserver
 from services.storage.open import open_store, supports_create_once
 from services.storage.s3 import S3Store
@@ -14,6 +15,7 @@ __all__ = [
     "ObjectStore",
     "S3Store",
     "StorageObserver",
+    "open_object",
     "open_store",
     "supports_create_once",
 ]

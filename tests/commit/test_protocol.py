@@ -25,11 +25,13 @@ from services.commit import (
     prepare_payload,
     write_record,
 )
-from services.commit.layout import claim_key
+from services.commit.layout import MEMBERS, claim_key
 from services.domain.errors import CommitConflict, IntegrityError
 from services.domain.models import Lease
 from services.domain.states import VideoStatus
 from services.storage import DirectoryStore
+from vipe_core.formats import member_path
+from vipe_core.formats.layout import info_path
 
 KEYS = ["b-2", "a_1", "c-3"]  # not sorted, as a plan may be
 
@@ -179,6 +181,23 @@ def test_results_must_settle_exactly_the_videos_of_the_lease(
     with pytest.raises(IntegrityError, match="shard"):
         prepare_payload(make_lease(KEYS), results, artifacts, tmp_path / "s", store)
     assert _keys(store, "") == []
+
+
+@pytest.mark.parametrize("key", ["a.b", "a/b", "../a", ""])
+def test_a_key_that_webdataset_would_split_is_refused(store: DirectoryStore, tmp_path: Path, key: str) -> None:
+    with pytest.raises(IntegrityError, match="webdataset"):
+        prepare_payload(make_lease([key]), [success(key)], tmp_path, tmp_path / "s", store)
+
+
+def test_the_artifacts_are_where_the_engine_puts_them(tmp_path: Path) -> None:
+    for attribute, members in MEMBERS.items():
+        for member in members:
+            expected = (
+                info_path(tmp_path, "k")
+                if member.extension == "json"
+                else tmp_path / member_path(attribute, member.name("k"))
+            )
+            assert member.path(tmp_path, "k") == expected
 
 
 def test_a_missing_artifact_is_named_and_nothing_is_uploaded(
