@@ -188,7 +188,7 @@ def test_chunk_size_does_not_matter(monkeypatch: pytest.MonkeyPatch, cells: int)
     assert_same_step(newton_step(problem, state, Options()), expected, 1e-10)
 
 
-def test_scale_prior_state_is_not_changed() -> None:
+def test_the_input_is_not_changed() -> None:
     problem, state = small_problem("pinhole")
     before = State(state.cam_from_world.clone(), state.inverse_depth.clone(), state.intrinsics.clone())
     newton_step(replace(problem, priors=Priors(log_focal=4.0)), state)

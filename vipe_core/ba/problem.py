@@ -7,7 +7,7 @@ cell p of the source grid, where the point behind p is seen in frame j:
 
 with G = cam_from_world and d the inverse depth along the ray that the camera model returns (z = 1 for pinhole).
 Units: pixels of the working image (integer pixel indices), inverse depth in 1 / world unit.
-Paper section 3.2, equations of the dense term and of the depth prior; see also `plan.py` for how it is solved.
+Paper section 3.2, equations of the dense term and of the depth prior; `torch_solver.py` says how it is solved.
 """
 
 from __future__ import annotations
@@ -183,9 +183,11 @@ class Result:
         state: New state, same shapes and dtypes as the input.
         status: Why it ended.
         iterations: Steps tried.
-        initial_cost: Robust cost before, sum of weight * rho, px^2.
+        initial_cost: Robust cost of the measurements before: sum of w rho(r^T W r / w), with w the larger of the two
+            weights of a measurement. Priors are not in it.
         cost: Robust cost after.
-        weight_sum: Sum of the weights of valid measurements at the end; `cost / weight_sum` is a mean squared residual.
+        weight_sum: Sum of these w over valid measurements at the end; `cost / weight_sum` is a mean squared residual,
+            px^2.
         log_focal_sigma: 1-sigma of log(f) from the reduced system at the end; NaN when the focal length was fixed.
     """
 
