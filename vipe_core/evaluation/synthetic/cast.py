@@ -101,6 +101,23 @@ def _hit_sphere(ox: float, oy: float, oz: float, dx: float, dy: float, dz: float
 
 
 @compiled
+def _lamp_cell(x: float, y: float, z: float, per_edge: int) -> int:
+    """The cell of a cube around the lamp that the direction (x, y, z) from the lamp passes through; 0 for the sun."""
+    if per_edge == 0:
+        return 0
+    ax, ay, az = abs(x), abs(y), abs(z)
+    if ax >= ay and ax >= az:
+        face, size, first, second = (1 if x > 0 else 0), ax, y, z
+    elif ay >= az:
+        face, size, first, second = (3 if y > 0 else 2), ay, z, x
+    else:
+        face, size, first, second = (5 if z > 0 else 4), az, x, y
+    column = min(per_edge - 1, int((first / size + 1.0) * 0.5 * per_edge))
+    row = min(per_edge - 1, int((second / size + 1.0) * 0.5 * per_edge))
+    return (face * per_edge + row) * per_edge + column
+
+
+@compiled
 def _occluded(
     x: float,
     y: float,
@@ -109,17 +126,16 @@ def _occluded(
     dy: float,
     dz: float,
     reach: float,
+    possible: NDArray[np.int64],
     kind: NDArray[np.int64],
     centre: NDArray[np.float64],
     rotation: NDArray[np.float64],
     half: NDArray[np.float64],
     bound: NDArray[np.float64],
-    dynamic: NDArray[np.bool_],
 ) -> bool:
-    """Whether a static solid lies between a surface point and the light, `reach` metres away."""
-    for i in range(kind.shape[0]):
-        if kind[i] == 2 or dynamic[i]:
-            continue
+    """Whether one of the solids `possible` lies between a surface point and the light, `reach` metres away."""
+    for slot in range(possible.shape[0]):
+        i = possible[slot]
         wx, wy, wz = centre[i, 0] - x, centre[i, 1] - y, centre[i, 2] - z
         along = wx * dx + wy * dy + wz * dz
         if along < -bound[i] or along > reach + bound[i]:
@@ -159,8 +175,10 @@ def cast(
     rotation: NDArray[np.float64],
     half: NDArray[np.float64],
     bound: NDArray[np.float64],
-    dynamic: NDArray[np.bool_],
     light: NDArray[np.float64],
+    cells_per_edge: int,
+    occluders: NDArray[np.int64],
+    occluder_counts: NDArray[np.int64],
     distance: NDArray[np.float64],
     surface: NDArray[np.int32],
     coords: NDArray[np.float64],
@@ -174,6 +192,7 @@ def cast(
         directions: (R, 3) unit vectors, camera axes.
         tile_of_ray: (R,) row of `candidates` for each ray.
         light: (6,) x, y, z, is_sun, ambient, diffuse.
+        cells_per_edge, occluders, occluder_counts: As in `shadows.ShadowCells`.
         distance: Output (R,) metres along the ray; inf where nothing is hit.
         surface: Output (R,) 16 * primitive + 2 * face + in_shadow, -1 where nothing is hit.
         coords: Output (R, 3) texture coordinates, metres: (u, v, 0) from a face's corner, the local point on a sphere.
@@ -269,7 +288,9 @@ def cast(
         else:
             # Start a little above the surface, else it would shade itself.
             sx, sy, sz = wx + 1e-4 * mx, wy + 1e-4 * my, wz + 1e-4 * mz
-            if _occluded(sx, sy, sz, vx, vy, vz, reach, kind, centre, rotation, half, bound, dynamic):
+            cell = _lamp_cell(sx - light[0], sy - light[1], sz - light[2], cells_per_edge)
+            possible = occluders[cell, : occluder_counts[cell]]
+            if _occluded(sx, sy, sz, vx, vy, vz, reach, possible, kind, centre, rotation, half, bound):
                 lambert, shadowed = 0.0, 1
         shade[ray] = corner * (light[4] * (0.95 + 0.05 * mz) + light[5] * lambert)
         surface[ray] = 16 * hit + 2 * face + shadowed

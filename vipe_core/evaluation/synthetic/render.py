@@ -13,6 +13,7 @@ from vipe_core.cameras import Camera
 from vipe_core.evaluation.synthetic.cast import cast, tile_candidates
 from vipe_core.evaluation.synthetic.rays import RayGrid, unit_rays
 from vipe_core.evaluation.synthetic.scene import PackedScene, Scene, pack
+from vipe_core.evaluation.synthetic.shadows import ShadowCells
 from vipe_core.evaluation.synthetic.texture import shade
 
 # A rotated 2x2 grid of subpixel offsets.
@@ -66,8 +67,9 @@ def render_frames(
         seed: Seed of that noise.
     """
     grid = RayGrid.of(camera)
+    shadows = ShadowCells.of(scene, pack(scene, 0.0))
     for index, pose in enumerate(world_from_cam):
-        frame = _render(scene, grid, np.ascontiguousarray(pose, dtype=np.float64), index / fps)
+        frame = _render(scene, grid, shadows, np.ascontiguousarray(pose, dtype=np.float64), index / fps)
         if noise > 0:
             rng = np.random.default_rng((seed, index))
             grainy = frame.rgb + noise * rng.standard_normal(frame.rgb.shape, dtype=np.float32)
@@ -76,7 +78,9 @@ def render_frames(
         yield frame
 
 
-def _render(scene: Scene, grid: RayGrid, world_from_cam: NDArray[np.float64], time_s: float) -> RenderedFrame:
+def _render(
+    scene: Scene, grid: RayGrid, shadows: ShadowCells, world_from_cam: NDArray[np.float64], time_s: float
+) -> RenderedFrame:
     camera = grid.camera
     packed = pack(scene, time_s)
     candidates = np.empty((len(grid.tile_axis), len(packed.kind)), np.int64)
@@ -92,7 +96,7 @@ def _render(scene: Scene, grid: RayGrid, world_from_cam: NDArray[np.float64], ti
     )
 
     def trace(rays: NDArray[np.float64], tile: NDArray[np.int64], pixel_angle: NDArray[np.float64]) -> _Hits:
-        return _trace(scene, packed, world_from_cam, rays, tile, pixel_angle, candidates, counts)
+        return _trace(scene, packed, shadows, world_from_cam, rays, tile, pixel_angle, candidates, counts)
 
     hits = trace(grid.directions, grid.tile, grid.pixel_angle)
     rgb = hits.rgb
@@ -122,6 +126,7 @@ def _render(scene: Scene, grid: RayGrid, world_from_cam: NDArray[np.float64], ti
 def _trace(
     scene: Scene,
     packed: PackedScene,
+    shadows: ShadowCells,
     world_from_cam: NDArray[np.float64],
     directions: NDArray[np.float64],
     tile: NDArray[np.int64],
@@ -145,8 +150,10 @@ def _trace(
         packed.local_from_world,
         packed.half,
         packed.bound,
-        packed.dynamic,
         light,
+        shadows.per_edge,
+        shadows.candidates,
+        shadows.counts,
         distance,
         surface,
         coords,
