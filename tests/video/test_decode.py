@@ -216,7 +216,7 @@ def test_a_one_frame_video(tmp_path: Path) -> None:
 def test_a_file_name_cannot_be_taken_for_a_protocol_or_pattern(tmp_path: Path) -> None:
     for name in ("concat:a|b.mp4", "frame%03d.mp4", "é ü.mp4", "-y.mp4"):
         write_clip(tmp_path / "plain.mp4", 2).rename(tmp_path / name)
-        assert len(list(open_source(tmp_path / name).frames())) == 2
+        assert len(list(decode(str(tmp_path / name), Limits(), 1, Damage(), lambda: None))) == 2
 
 
 @given(st.lists(st.one_of(st.none(), st.floats(-1e6, 1e6), st.just(float("nan"))), max_size=40))
@@ -240,7 +240,7 @@ def test_missing_repeated_and_reset_times() -> None:
 
 
 ENTRY_CLIPS = {
-    "closed.mp4": ("libx264", {"g": "12", "bf": "3"}),
+    "closed.mp4": ("libx264", {"g": "12", "bf": "3", "sc_threshold": "0"}),
     "open.mp4": ("libx264", {"x264-params": "open-gop=1:bframes=3:keyint=12:scenecut=0"}),
     "open.mkv": ("libx264", {"x264-params": "open-gop=1:bframes=3:keyint=12:scenecut=0"}),
     "refresh.mp4": ("libx264", {"x264-params": "intra-refresh=1:keyint=12"}),
@@ -253,13 +253,27 @@ ENTRY_CLIPS = {
 @pytest.mark.parametrize("name", ENTRY_CLIPS)
 def test_beginning_at_a_key_picture_gives_the_same_frames_as_beginning_at_zero(tmp_path: Path, name: str) -> None:
     codec, options = ENTRY_CLIPS[name]
-    source = VideoFileSource(write_clip(tmp_path / name, 40, codec=codec, options=options))
-    whole = list(source.frames())
+    path = str(write_clip(tmp_path / name, 40, codec=codec, options=options))
+
+    def content(entry: tuple[int, int] | None = None, log: EntryLog | None = None) -> list[tuple[int, float, bytes]]:
+        pictures = decode(path, Limits(), 2, Damage(), lambda: None, entry=entry, log=log)
+        return [(index, time_s, frame.to_ndarray().tobytes()) for index, time_s, frame in pictures]
+
+    log = EntryLog()
+    whole = content(log=log)
     assert len(whole) == 40
-    for start, stop in ((12, 13), (23, 27), (38, None)):
-        part = list(source.frames(start=start, stop=stop))
-        assert [(f.index, f.timestamp_s) for f in part] == [(f.index, f.timestamp_s) for f in whole[start:stop]]
-        assert all(np.array_equal(a.rgb, b.rgb) for a, b in zip(part, whole[start:stop], strict=True))
+    expected = {"refresh.mp4": [], "stream.ts": []}.get(name, [12, 24, 36])
+    assert [index for index, _ in log.thinned(100)] == expected
+    for entry in log.thinned(100):
+        assert content(entry=entry) == whole[entry[0] :]
+
+
+def test_a_source_begins_at_key_pictures_after_a_complete_pass(tmp_path: Path) -> None:
+    source = VideoFileSource(write_clip(tmp_path / "c.mp4", 40, options={"g": "12", "bf": "3"}))
+    whole = list(source.frames())
+    part = list(source.frames(start=26, stop=39))
+    assert [(f.index, f.timestamp_s) for f in part] == [(f.index, f.timestamp_s) for f in whole[26:39]]
+    assert all(np.array_equal(a.rgb, b.rgb) for a, b in zip(part, whole[26:39], strict=True))
 
 
 def test_a_wrong_entry_falls_back_to_zero(tmp_path: Path) -> None:
@@ -272,10 +286,3 @@ def test_a_wrong_entry_falls_back_to_zero(tmp_path: Path) -> None:
         assert [(i, t) for i, t, _ in right] == whole[index:]
         wrong = decode(str(path), Limits(), 1, Damage(), lambda: None, entry=(index, pts + 1))
         assert [(i, t) for i, t, _ in wrong] == whole
-
-
-def test_entries_are_not_offered_where_the_container_has_no_index(tmp_path: Path) -> None:
-    log = EntryLog()
-    path = write_clip(tmp_path / "c.ts", 30, options={"g": "10"})
-    assert len(list(decode(str(path), Limits(), 1, Damage(), lambda: None, log=log))) == 30
-    assert log.thinned(100) == []

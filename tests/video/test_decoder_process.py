@@ -98,7 +98,7 @@ def test_closing_or_exhausting_an_iterator_leaves_no_process_and_no_descriptor(c
     frames = source.frames()
     next(frames)
     assert len(decoder_children(os.getpid())) == 1
-    frames.close()  # type: ignore[attr-defined]
+    frames.close()
     assert decoder_children(os.getpid()) == []
     for _ in source.frames((64, 48)):
         break

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from video_clips import number_of, picture, write_clip
 
-from vipe_core.video import Frame, FrameCache, VideoFileSource, VideoInfo
+from vipe_core.video import Frame, FrameCache, FrameStream, VideoFileSource, VideoInfo
 
 FRAME_BYTES = 24 * 12 * 3
 
@@ -26,7 +25,7 @@ class ListedSource:
     def info(self) -> VideoInfo:
         return VideoInfo("listed", "listed", 24, 12, 25.0, self.count, None, 0, "raw", "rgb24", 0)
 
-    def frames(self, size: tuple[int, int] | None = None, start: int = 0, stop: int | None = None) -> Iterator[Frame]:
+    def frames(self, size: tuple[int, int] | None = None, start: int = 0, stop: int | None = None) -> FrameStream:
         self.starts += 1
         for index in range(start, self.count if stop is None else min(stop, self.count)):
             self.decoded += 1

@@ -9,13 +9,14 @@ from vipe_core.video.limits import Limits
 from vipe_core.video.naming import sanitise_name, unique_names
 from vipe_core.video.opening import open_source
 from vipe_core.video.probe import probe
-from vipe_core.video.source import Frame, FrameSource, VideoInfo
+from vipe_core.video.source import Frame, FrameSource, FrameStream, VideoInfo
 from vipe_core.video.video_file import VideoFileSource
 
 __all__ = [
     "Frame",
     "FrameCache",
     "FrameSource",
+    "FrameStream",
     "ImageDirectorySource",
     "Limits",
     "VideoFileSource",

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Iterator
 from types import TracebackType
 
 import numpy as np
 from numpy.typing import NDArray
 
-from vipe_core.video.source import Frame, FrameSource
+from vipe_core.video.source import Frame, FrameSource, FrameStream
 
 
 class FrameCache:
@@ -30,7 +29,7 @@ class FrameCache:
         self._max_bytes = max_bytes
         self._held: OrderedDict[int, Frame] = OrderedDict()
         self._held_bytes = 0
-        self._cursor: Iterator[Frame] | None = None
+        self._cursor: FrameStream | None = None
         self._next_index = 0
 
     def __enter__(self) -> FrameCache:
@@ -91,7 +90,6 @@ class FrameCache:
             self._held_bytes -= oldest.rgb.nbytes
 
     def _close_cursor(self) -> None:
-        close = getattr(self._cursor, "close", None)
-        if close is not None:
-            close()
-        self._cursor = None
+        if self._cursor is not None:
+            self._cursor.close()
+            self._cursor = None

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 
 from vipe_core.errors import EmptyMedia, MediaNotFound
 from vipe_core.video.limits import Limits
 from vipe_core.video.naming import sanitise_name
 from vipe_core.video.process import DecoderProcess
-from vipe_core.video.source import Frame, VideoInfo
+from vipe_core.video.source import Frame, FrameStream, VideoInfo
 from vipe_core.video.video_file import STALL_S, check_range
 from vipe_core.video.wire import Request
 
@@ -87,7 +86,7 @@ class ImageDirectorySource:
         """Name of the file behind each frame."""
         return tuple(file.name for file in self._files)
 
-    def frames(self, size: tuple[int, int] | None = None, start: int = 0, stop: int | None = None) -> Iterator[Frame]:
+    def frames(self, size: tuple[int, int] | None = None, start: int = 0, stop: int | None = None) -> FrameStream:
         """See `FrameSource.frames`."""
         check_range(size, start, stop)
         end = len(self._files) if stop is None else min(stop, len(self._files))

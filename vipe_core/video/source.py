@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Generator
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -48,13 +48,17 @@ class Frame:
     rgb: NDArray[np.uint8]
 
 
+# A generator, so that `close` (or `contextlib.closing`) is there to end the decoder early.
+FrameStream: TypeAlias = Generator[Frame, None, None]
+
+
 class FrameSource(Protocol):
     """Frames of one video, in bounded memory: every call decodes again what it needs."""
 
     @property
     def info(self) -> VideoInfo: ...
 
-    def frames(self, size: tuple[int, int] | None = None, start: int = 0, stop: int | None = None) -> Iterator[Frame]:
+    def frames(self, size: tuple[int, int] | None = None, start: int = 0, stop: int | None = None) -> FrameStream:
         """Frames [start, stop) in order, area-resized to `size` = (width, height) if given.
 
         Raises:

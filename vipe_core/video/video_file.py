@@ -5,14 +5,13 @@ from __future__ import annotations
 import bisect
 import logging
 import os
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 from vipe_core.video.limits import Limits
 from vipe_core.video.probe import PROBE_BUDGET_S, file_size_bytes, probe
 from vipe_core.video.process import DecoderProcess
-from vipe_core.video.source import Frame, VideoInfo
+from vipe_core.video.source import Frame, FrameStream, VideoInfo
 from vipe_core.video.wire import Request
 
 _LOG = logging.getLogger(__name__)
@@ -71,7 +70,7 @@ class VideoFileSource:
         """What was wrong with the file, in one sentence; None before a pass has reached the end, or if nothing was."""
         return self._damage
 
-    def frames(self, size: tuple[int, int] | None = None, start: int = 0, stop: int | None = None) -> Iterator[Frame]:
+    def frames(self, size: tuple[int, int] | None = None, start: int = 0, stop: int | None = None) -> FrameStream:
         """See `FrameSource.frames`."""
         check_range(size, start, stop)
         if stop is not None and stop <= start:
