@@ -12,32 +12,40 @@ from alembic.script import ScriptDirectory
 from sqlalchemy import func, select
 
 if TYPE_CHECKING:
-    from services.store.database import Database
+    from services.store.database import Database, Tx
 
 # Processes that start together upgrade one after the other.
 _LOCK = 0x76697065
 
 
 def upgrade(database: Database, revision: str = "head") -> None:
-    """Bring the schema to a revision in one transaction. Safe to call from many processes at once."""
+    """Bring the schema to a revision in one transaction. Safe to call from many processes at once.
 
-    config = Config()
-    config.set_main_option("script_location", str(Path(__file__).parent).replace("%", "%%"))
-    with database.engine.connect().execution_options(vipe_write=True) as conn, conn.begin():
+    Raises:
+        StoreUnavailable: The database does not answer.
+    """
+
+    def work(tx: Tx) -> None:
         if database.dialect == "postgresql":
-            conn.execute(select(func.pg_advisory_xact_lock(_LOCK)))
-        config.attributes["connection"] = conn
+            tx.run(select(func.pg_advisory_xact_lock(_LOCK)))
+        config = _config()
+        config.attributes["connection"] = tx.conn
         command.upgrade(config, revision)
+
+    database.write(work)
 
 
 def current(database: Database) -> str | None:
     """The revision that the database is at, None for an empty one."""
-    with database.engine.connect() as conn:
-        return MigrationContext.configure(conn).get_current_revision()
+    return database.read(lambda tx: MigrationContext.configure(tx.conn).get_current_revision())
 
 
 def head() -> str | None:
     """The newest revision in this package."""
+    return ScriptDirectory.from_config(_config()).get_current_head()
+
+
+def _config() -> Config:
     config = Config()
     config.set_main_option("script_location", str(Path(__file__).parent).replace("%", "%%"))
-    return ScriptDirectory.from_config(config).get_current_head()
+    return config

@@ -1,0 +1,104 @@
+"""The application: routes, authentication, errors, OpenAPI."""
+
+from __future__ import annotations
+
+import secrets
+import threading
+from typing import Annotated, Any
+
+from fastapi import APIRouter, Depends, FastAPI, Request, Response
+from fastapi.openapi.utils import get_openapi
+from fastapi.security import HTTPAuthorizationCredentials, HTTPBearer
+
+from services.api import problems, routes
+from services.api.middleware import BodyLimit, RequestContext
+from services.api.problems import Problem, Unauthorized
+from services.api.schemas import Status
+from services.observability.metrics import CONTENT_TYPE, Metrics, package_version
+from services.settings import Settings
+from services.store.base import Store
+
+_bearer = HTTPBearer(auto_error=False, description="The service's `api_key`, where one is set.")
+
+
+def authenticate(
+    request: Request, credentials: Annotated[HTTPAuthorizationCredentials | None, Depends(_bearer)]
+) -> None:
+    """Raises Unauthorized unless the request carries the service's key (or the service has none)."""
+    settings: Settings = request.app.state.settings
+    if settings.api_key is None:
+        return
+    given = "" if credentials is None else credentials.credentials
+    if not secrets.compare_digest(given.encode(), settings.api_key.get_secret_value().encode()):
+        raise Unauthorized("send the service's key as `Authorization: Bearer <key>`")
+
+
+def create_app(store: Store, settings: Settings, metrics: Metrics | None = None) -> FastAPI:
+    """The API over a store. The caller opens and closes the store.
+
+    Args:
+        store: Where the jobs are.
+        settings: `api_key` and `max_body_bytes` are used here.
+        metrics: What `/metrics` shows; share it with an agent in the same process. Default: one of its own.
+    """
+    app = FastAPI(
+        title="ViPE annotation service",
+        version=package_version(),
+        summary="Camera poses, intrinsics and dense depth from raw video.",
+        redoc_url=None,
+    )
+    metrics = metrics or Metrics()
+    app.state.store = store
+    app.state.settings = settings
+    app.state.metrics = metrics
+    app.state.draining = threading.Event()
+
+    problems.install(app)
+    app.add_middleware(BodyLimit, max_bytes=settings.max_body_bytes)
+    app.add_middleware(RequestContext, metrics=metrics)
+    app.include_router(routes.router, dependencies=[Depends(authenticate)])
+    app.include_router(_operations)
+    _document_problems(app)
+    return app
+
+
+_operations = APIRouter(tags=["operations"])
+
+
+@_operations.get("/healthz")
+def healthz() -> Status:
+    """The process answers."""
+    return Status()
+
+
+@_operations.get("/readyz", responses=problems.responses(503))
+def readyz(request: Request) -> Status:
+    """The store answers too."""
+    request.app.state.store.ping()
+    return Status()
+
+
+@_operations.get("/metrics", response_class=Response, responses={200: {"content": {"text/plain": {}}}})
+def metrics(request: Request) -> Response:
+    """Prometheus metrics."""
+    page: Metrics = request.app.state.metrics
+    page.set_counts(request.app.state.store.counts())
+    return Response(page.render(), media_type=CONTENT_TYPE)
+
+
+def _document_problems(app: FastAPI) -> None:
+    """Add the schema of problems, which routes refer to by name, and drop the framework's own error schemas."""
+
+    def openapi() -> dict[str, Any]:
+        if app.openapi_schema is None:
+            document = get_openapi(title=app.title, version=app.version, summary=app.summary, routes=app.routes)
+            schemas = document["components"]["schemas"]
+            for unused in ("HTTPValidationError", "ValidationError"):
+                schemas.pop(unused, None)
+            problem = Problem.model_json_schema(ref_template="#/components/schemas/{model}")
+            schemas.update(problem.pop("$defs"))
+            schemas["Problem"] = problem
+            app.openapi_schema = document
+        return app.openapi_schema
+
+    app.openapi = openapi  # type: ignore[method-assign]

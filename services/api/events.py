@@ -1,0 +1,101 @@
+"""A job's history as a stream of server-sent events, and as pages."""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections.abc import AsyncIterator
+from functools import partial
+from typing import Any
+
+import anyio
+from anyio.to_thread import run_sync
+from sse_starlette import EventSourceResponse, ServerSentEvent
+
+from services.api import paging
+from services.api.schemas import EventPage, EventView, JobView
+from services.domain.errors import InvalidPageToken, StoreUnavailable
+from services.domain.events import EventKind
+from services.domain.models import Event, Job
+from services.domain.states import JobState
+from services.store.base import Store
+
+LAST_EVENT_ID = r"^[0-9]{1,18}$"
+_POLL_S = 0.5
+_POLLS_PER_PROGRESS = 2
+_BATCH = 500
+_GRACE_S = 5.0
+_log = logging.getLogger(__name__)
+
+
+def wants_stream(accept: str) -> bool:
+    """Whether the caller takes a stream; one that asks for JSON and does not mention streams gets a page."""
+    return "text/event-stream" in accept or "application/json" not in accept
+
+
+def event_page(store: Store, job_id: str, *, limit: int, page_token: str | None) -> EventPage:
+    """One page of the history, oldest first."""
+    name = f"events of {job_id}"
+    after = paging.cursor(page_token, of=name) or "0"
+    if not after.isascii() or not after.isdigit() or len(after) > 18:
+        raise InvalidPageToken("this page_token was not given out for this list; start again without one")
+    events = store.events(job_id, after_seq=int(after), limit=limit + 1)
+    more = len(events) > limit
+    events = events[:limit]
+    following = paging.token(str(events[-1].seq), of=name) if more else None
+    return EventPage(items=[EventView.of(event) for event in events], next_page_token=following)
+
+
+def event_stream(store: Store, job_id: str, *, after_seq: int, draining: threading.Event) -> EventSourceResponse:
+    """The history behind `after_seq` and everything that follows until the job has ended or the server drains.
+
+    Raises:
+        JobNotFound: There is no such job (before the stream begins).
+    """
+    job = store.get_job(job_id)
+    first = store.events(job_id, after_seq=after_seq, limit=_BATCH)
+    # Without an event of its own and some grace, the library cuts streams off when the server stops.
+    return EventSourceResponse(
+        _follow(store, job, after_seq, first, draining),
+        sep="\n",
+        ping=15,
+        shutdown_event=anyio.Event(),
+        shutdown_grace_period=_GRACE_S,
+    )
+
+
+async def _follow(
+    store: Store, job: Job, seq: int, events: list[Event], draining: threading.Event
+) -> AsyncIterator[ServerSentEvent]:
+    """The store is asked from the thread pool; the event loop only sleeps and sends.
+
+    The job is always read before its events: what its state says has happened is then among the events.
+    """
+    polls = 0
+    while True:
+        for event in events:
+            seq = event.seq
+            yield _sse(event)
+            if EventKind(event.kind).terminal:
+                return
+        # The reader knows the job's last event already.
+        if job.state.terminal and not events:
+            return
+        if draining.is_set():
+            return
+        if len(events) < _BATCH:
+            if polls % _POLLS_PER_PROGRESS == 0 and job.state is not JobState.QUEUED and not job.state.terminal:
+                yield ServerSentEvent(event="progress", data=JobView.of(job).model_dump_json(), sep="\n")
+            await anyio.sleep(_POLL_S)
+        polls += 1
+        try:
+            job = await run_sync(store.get_job, job.id)
+            events = await run_sync(partial(store.events, job.id, after_seq=seq, limit=_BATCH))
+        except StoreUnavailable as error:
+            _log.warning("event stream of %s ends: %s", job.id, error)
+            return
+
+
+def _sse(event: Event) -> ServerSentEvent:
+    data: Any = EventView.of(event).model_dump_json()
+    return ServerSentEvent(id=str(event.seq), event=event.kind, data=data, sep="\n")

@@ -1,0 +1,58 @@
+"""What a job may ask for, from the engine's own lists: only what works is offered."""
+
+from __future__ import annotations
+
+import re
+from functools import cache
+from typing import Literal, get_args
+
+# What the engine writes for every video.
+OfferedAttribute = Literal["pose", "intrinsics", "depth", "rgb"]
+ATTRIBUTES: tuple[OfferedAttribute, ...] = get_args(OfferedAttribute)
+
+_BUCKET = re.compile(r"[a-z0-9][a-z0-9.-]{1,61}[a-z0-9]")
+_UNWELCOME = re.compile(r"[\x00-\x1f\x7f\\]")
+
+
+@cache
+def presets() -> tuple[str, ...]:
+    from vipe_core.pipeline.presets import PRESETS
+
+    return PRESETS
+
+
+@cache
+def cameras() -> tuple[str, ...]:
+    from vipe_core.pipeline.presets import CAMERAS
+
+    return CAMERAS
+
+
+def one_of(value: str, offered: tuple[str, ...]) -> str:
+    if value not in offered:
+        raise ValueError(f"{value!r} is not on offer; on offer: {', '.join(offered)}")
+    return value
+
+
+def address(value: str) -> str:
+    """Check an absolute path or `s3://bucket/key`.
+
+    Raises:
+        ValueError: It is neither.
+    """
+    if _UNWELCOME.search(value) or not value.isprintable():
+        raise ValueError("an address must not hold control characters or backslashes")
+    if value.startswith("s3://"):
+        bucket, _, key = value.removeprefix("s3://").partition("/")
+        if not _BUCKET.fullmatch(bucket):
+            raise ValueError(f"{bucket!r} is not the name of an S3 bucket")
+        if "?" in key or "#" in key:
+            raise ValueError("an S3 address must not hold '?' or '#'")
+        segments = key.rstrip("/").split("/") if key.rstrip("/") else []
+    elif value.startswith("/") and not value.startswith("//"):
+        segments = [s for s in value.split("/") if s]
+    else:
+        raise ValueError(f"{value!r} must be an absolute path or s3://bucket/key")
+    if any(s in ("", ".", "..") for s in segments):
+        raise ValueError("an address must not hold empty, '.' or '..' segments")
+    return value

@@ -1,0 +1,156 @@
+"""Jobs over HTTP. Handlers are synchronous: they run in the thread pool, never in the event loop."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from fastapi import APIRouter, Depends, Header, Path, Query, Request, Response
+
+from services.api import paging
+from services.api.events import LAST_EVENT_ID, event_page, event_stream, wants_stream
+from services.api.problems import UnsupportedMediaType, responses
+from services.api.schemas import (
+    EventPage,
+    JobPage,
+    JobRequest,
+    JobView,
+    ShardPage,
+    ShardView,
+    VideoPage,
+    VideoView,
+)
+from services.domain.states import JobState, VideoStatus
+from services.store.base import Store
+
+JobId = Annotated[str, Path(max_length=64, description="`job_...`")]
+Limit = Annotated[int, Query(ge=1, le=1000, description="Most items on the page.")]
+PageToken = Annotated[str | None, Query(max_length=1024, description="`next_page_token` of the page before.")]
+
+
+def get_store(request: Request) -> Store:
+    store: Store = request.app.state.store
+    return store
+
+
+def require_json(content_type: Annotated[str, Header(include_in_schema=False)] = "") -> None:
+    media_type = content_type.partition(";")[0].strip().lower()
+    if media_type != "application/json":
+        raise UnsupportedMediaType(f"the body must be application/json, not {media_type or 'untyped'}")
+
+
+TheStore = Annotated[Store, Depends(get_store)]
+
+router = APIRouter(prefix="/v1/jobs", tags=["jobs"])
+
+
+@router.post(
+    "",
+    status_code=202,
+    response_model=JobView,
+    dependencies=[Depends(require_json)],
+    responses={
+        202: {
+            "description": "Accepted. The job runs in the background.",
+            "headers": {
+                "Location": {"description": "Where the job is.", "schema": {"type": "string"}},
+                "Idempotent-Replayed": {
+                    "description": "`true` if this key and body had created the job before.",
+                    "schema": {"type": "string", "enum": ["true"]},
+                },
+            },
+        },
+        **responses(400, 401, 409, 413, 415, 422, 503),
+    },
+)
+def create_job(
+    body: JobRequest,
+    store: TheStore,
+    response: Response,
+    idempotency_key: Annotated[
+        str | None,
+        Header(min_length=1, max_length=255, pattern=r"^[\x21-\x7e]+$", description="The same key creates one job."),
+    ] = None,
+) -> JobView:
+    """Create a job. Sent again with the same `Idempotency-Key` and body, it answers with the job of the first time."""
+    job, created = store.create_job(body.to_spec(), idempotency_key=idempotency_key)
+    response.headers["Location"] = f"/v1/jobs/{job.id}"
+    if not created:
+        response.headers["Idempotent-Replayed"] = "true"
+    return JobView.of(job)
+
+
+@router.get("", responses=responses(400, 401, 422, 503))
+def list_jobs(
+    store: TheStore, limit: Limit = 50, page_token: PageToken = None, state: JobState | None = None
+) -> JobPage:
+    """List jobs, newest first."""
+    jobs, after = store.list_jobs(limit=limit, after=paging.cursor(page_token, of="jobs"), state=state)
+    return JobPage(items=[JobView.of(job) for job in jobs], next_page_token=paging.token(after, of="jobs"))
+
+
+@router.get("/{job_id}", responses=responses(401, 404, 422, 503))
+def get_job(job_id: JobId, store: TheStore) -> JobView:
+    """Show a job and its progress."""
+    return JobView.of(store.get_job(job_id))
+
+
+@router.post("/{job_id}/cancel", status_code=202, responses=responses(401, 404, 409, 422, 503))
+def cancel_job(job_id: JobId, store: TheStore) -> JobView:
+    """Cancel a job. What is committed stays; work under way is stopped, and the job is cancelled when it has."""
+    return JobView.of(store.request_cancel(job_id))
+
+
+@router.get("/{job_id}/videos", responses=responses(400, 401, 404, 422, 503))
+def list_videos(
+    job_id: JobId,
+    store: TheStore,
+    status: VideoStatus | None = None,
+    error_code: Annotated[str | None, Query(max_length=64)] = None,
+    limit: Limit = 100,
+    page_token: PageToken = None,
+) -> VideoPage:
+    """List the videos of a job with their results, by key."""
+    name = f"videos of {job_id}"
+    after = paging.cursor(page_token, of=name)
+    rows, after = store.list_videos(job_id, status=status, error_code=error_code, limit=limit, after=after)
+    return VideoPage(items=[VideoView.of(row) for row in rows], next_page_token=paging.token(after, of=name))
+
+
+@router.get("/{job_id}/shards", responses=responses(400, 401, 404, 422, 503))
+def list_shards(job_id: JobId, store: TheStore, limit: Limit = 100, page_token: PageToken = None) -> ShardPage:
+    """List the shards of a job, in order."""
+    name = f"shards of {job_id}"
+    shards, after = store.list_shards(job_id, limit=limit, after=paging.cursor(page_token, of=name))
+    return ShardPage(items=[ShardView.of(s) for s in shards], next_page_token=paging.token(after, of=name))
+
+
+@router.get(
+    "/{job_id}/events",
+    response_model=EventPage,
+    responses={
+        200: {
+            "description": "A stream of events, or with `Accept: application/json` a page of them.",
+            "content": {"text/event-stream": {"schema": {"type": "string"}}},
+        },
+        **responses(400, 401, 404, 422, 503),
+    },
+)
+def list_events(
+    request: Request,
+    job_id: JobId,
+    store: TheStore,
+    limit: Limit = 100,
+    page_token: PageToken = None,
+    last_event_id: Annotated[
+        str | None, Header(max_length=20, pattern=LAST_EVENT_ID, description="Go on behind this event of the stream.")
+    ] = None,
+) -> Response | EventPage:
+    """Follow a job.
+
+    As a stream of server-sent events: its history and what happens next, each with its number as `id`, and while it
+    runs a `progress` event about once a second (no `id`; its data is the job). It ends behind the last event of a job
+    that has ended. Reconnect with `Last-Event-ID` to miss nothing.
+    """
+    if wants_stream(request.headers.get("accept", "")):
+        return event_stream(store, job_id, after_seq=int(last_event_id or 0), draining=request.app.state.draining)
+    return event_page(store, job_id, limit=limit, page_token=page_token)

@@ -1,0 +1,211 @@
+"""What goes in and out over HTTP. Names are snake_case, times RFC 3339 in UTC."""
+
+from __future__ import annotations
+
+from datetime import datetime
+from typing import Annotated, Any, Literal, Self
+
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
+
+from services.api import offer
+from services.domain.models import Event, Job, JobSpec, Shard
+from services.domain.states import JobState, ShardState, VideoStatus
+from services.store.base import VideoRow
+
+Address = Annotated[str, Field(min_length=1, max_length=2048), AfterValidator(offer.address)]
+
+
+class JobRequest(BaseModel):
+    """A job to run."""
+
+    model_config = ConfigDict(
+        extra="forbid",
+        strict=True,
+        json_schema_extra={"examples": [{"inputs": ["s3://bucket/videos/"], "output": "s3://bucket/annotations"}]},
+    )
+
+    inputs: list[Address] = Field(
+        min_length=1,
+        max_length=1000,
+        description="Each a directory, a video file, `s3://bucket/key`, or `s3://bucket/prefix/` (trailing slash).",
+    )
+    output: Address = Field(description="A directory or `s3://bucket/prefix` that belongs to this job alone.")
+    preset: Annotated[str, AfterValidator(lambda v: offer.one_of(v, offer.presets()))] = Field(
+        default="classical", max_length=64, description="Engine preset."
+    )
+    camera: Annotated[str, AfterValidator(lambda v: offer.one_of(v, offer.cameras()))] = Field(
+        default="pinhole", max_length=64, description="Camera model."
+    )
+    attributes: list[offer.OfferedAttribute] = Field(
+        default_factory=lambda: list(offer.ATTRIBUTES),
+        max_length=8,
+        description="Tars to write; `pose` and `intrinsics` always are.",
+    )
+    shard_max_videos: int = Field(default=16, ge=1, le=1000, description="Most videos in one shard.")
+    shard_max_input_bytes: int = Field(
+        default=1 << 30, ge=1, le=1 << 40, description="Most input bytes in one shard; one video always fits."
+    )
+    name: str = Field(default="", max_length=200, description="Free text for humans.")
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        if self.output.strip("/") == "":
+            raise ValueError("output must not be the root directory")
+        if self.output.rstrip("/") in {uri.rstrip("/") for uri in self.inputs}:
+            raise ValueError("output must not be one of the inputs")
+        if "\x00" in self.name:
+            raise ValueError("name must not hold NUL characters")
+        return self
+
+    def to_spec(self) -> JobSpec:
+        wanted = {"pose", "intrinsics", *self.attributes}
+        return JobSpec(
+            inputs=tuple(self.inputs),
+            output=self.output.rstrip("/"),
+            preset=self.preset,
+            camera=self.camera,
+            attributes=tuple(a for a in offer.ATTRIBUTES if a in wanted),
+            shard_max_videos=self.shard_max_videos,
+            shard_max_input_bytes=self.shard_max_input_bytes,
+            name=self.name,
+        )
+
+
+class _View(BaseModel):
+    model_config = ConfigDict(from_attributes=True)
+
+
+class SpecView(_View):
+    inputs: list[str]
+    output: str
+    preset: str
+    camera: str
+    attributes: list[str]
+    shard_max_videos: int
+    shard_max_input_bytes: int
+    name: str
+
+
+class ProgressView(_View):
+    """Videos count as succeeded, failed or quarantined once their shard is committed."""
+
+    shards_total: int
+    shards_committed: int
+    videos_total: int
+    videos_done: int = Field(description="Settled videos plus what workers report as done in shards under way.")
+    videos_succeeded: int
+    videos_failed: int
+    videos_quarantined: int
+    frames_done: int
+    frames_expected: int | None = Field(description="Estimate of all frames; null until something is known.")
+    frames_per_s: float = Field(description="Over the recent past; 0 when idle.")
+    eta_s: float | None = Field(description="Null when unknown.")
+
+
+class JobView(_View):
+    id: str
+    tenant: str
+    state: JobState
+    spec: SpecView
+    planned: bool = Field(description="Whether every shard is known, so that the totals are final.")
+    error_code: str | None
+    error_message: str | None
+    created_at: datetime
+    updated_at: datetime
+    started_at: datetime | None
+    finished_at: datetime | None
+    progress: ProgressView
+
+    @classmethod
+    def of(cls, job: Job) -> JobView:
+        return cls.model_validate(job)
+
+
+class ShardView(_View):
+    id: str
+    job_id: str
+    ordinal: int
+    state: ShardState
+    num_videos: int
+    attempts: int
+    holder: str | None
+    lease_expires_at: datetime | None
+    tar_name: str | None
+
+    @classmethod
+    def of(cls, shard: Shard) -> ShardView:
+        return cls.model_validate(shard)
+
+
+class VideoView(_View):
+    """A video; what was found out about it is null until its shard is committed, and where it failed."""
+
+    key: str
+    uri: str
+    size_bytes: int
+    etag: str | None
+    shard_id: str
+    status: VideoStatus
+    attempt: int | None = None
+    error_code: str | None = None
+    error_message: str | None = None
+    num_frames: int | None = None
+    num_keyframes: int | None = None
+    width: int | None = None
+    height: int | None = None
+    fps: float | None = None
+    duration_s: float | None = None
+    camera_model: str | None = None
+    camera_params: list[float] | None = None
+    fov_x_deg: float | None = None
+    trajectory_length: float | None = None
+    scale: str | None = None
+    depth_kind: str | None = None
+    quality: dict[str, Any] | None = None
+    seconds: float | None = None
+    timings_s: dict[str, float] | None = None
+    source: dict[str, Any] | None = None
+    provenance: dict[str, Any] | None = None
+
+    @classmethod
+    def of(cls, row: VideoRow) -> VideoView:
+        found = {} if row.result is None else row.result.to_json()
+        ref = row.ref
+        place = {"key": ref.key, "uri": ref.uri, "size_bytes": ref.size_bytes, "etag": ref.etag}
+        return cls.model_validate({**found, **place, "shard_id": row.shard_id, "status": row.status})
+
+
+class EventView(_View):
+    seq: int
+    job_id: str
+    at: datetime
+    kind: str
+    data: dict[str, Any]
+
+    @classmethod
+    def of(cls, event: Event) -> EventView:
+        return cls.model_validate(event)
+
+
+class JobPage(BaseModel):
+    items: list[JobView]
+    next_page_token: str | None
+
+
+class ShardPage(BaseModel):
+    items: list[ShardView]
+    next_page_token: str | None
+
+
+class VideoPage(BaseModel):
+    items: list[VideoView]
+    next_page_token: str | None
+
+
+class EventPage(BaseModel):
+    items: list[EventView]
+    next_page_token: str | None
+
+
+class Status(BaseModel):
+    status: Literal["ok"] = "ok"

@@ -1,0 +1,32 @@
+"""The API as a process of its own, as it is deployed: takes a database address, listens on a free port, says where."""
+
+from __future__ import annotations
+
+import sys
+import threading
+
+from services.api import create_app, create_server
+from services.settings import Settings
+from services.store.sql import SqlStore
+
+
+def main() -> None:
+    given = dict(arg.split("=", 1) for arg in sys.argv[2:])
+    settings = Settings.model_validate({"database_url": sys.argv[1], "port": 0, **given})
+    store = SqlStore(settings.database_url)
+    server = create_server(create_app(store, settings), settings)
+
+    def tell() -> None:
+        while not server.started:
+            stopped.wait(0.01)
+        sys.stdout.write(f"{server.url}\n")
+        sys.stdout.flush()
+
+    stopped = threading.Event()
+    threading.Thread(target=tell, daemon=True).start()
+    server.run()
+    store.close()
+
+
+if __name__ == "__main__":
+    main()

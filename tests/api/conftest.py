@@ -1,0 +1,65 @@
+"""A real uvicorn process over a SQLite file, and the same file opened beside it to play the agent."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import httpx
+import pytest
+
+from services.store.sql import SqlStore
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+@dataclass
+class Service:
+    url: str
+    process: subprocess.Popen[str]
+    database_url: str
+
+
+@contextlib.contextmanager
+def running(database_url: str, *settings: str) -> Iterator[Service]:
+    process = subprocess.Popen(
+        [sys.executable, str(Path(__file__).with_name("api_process.py")), database_url, *settings],
+        stdout=subprocess.PIPE,
+        text=True,
+        cwd=ROOT,
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+    )
+    try:
+        assert process.stdout is not None
+        url = process.stdout.readline().strip()
+        assert url, f"the API did not start: {process.wait()}"
+        yield Service(url, process, database_url)
+    finally:
+        process.terminate()
+        process.wait(timeout=60)
+        assert process.stdout is not None
+        process.stdout.close()
+
+
+@pytest.fixture(scope="module")
+def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Service]:
+    with running(f"sqlite:///{tmp_path_factory.mktemp('api')}/store.db") as started:
+        yield started
+
+
+@pytest.fixture(scope="module")
+def store(service: Service) -> Iterator[SqlStore]:
+    opened = SqlStore(service.database_url)
+    yield opened
+    opened.close()
+
+
+@pytest.fixture(scope="module")
+def http(service: Service) -> Iterator[httpx.Client]:
+    with httpx.Client(base_url=service.url, timeout=60) as client:
+        yield client

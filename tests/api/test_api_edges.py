@@ -1,0 +1,134 @@
+"""What surrounds the jobs: errors, ids, authentication, health, metrics, the OpenAPI document."""
+
+from __future__ import annotations
+
+import threading
+import time
+from pathlib import Path
+
+import httpx
+import pytest
+from api_helpers import assert_problem, submit
+from conftest import running
+from openapi_spec_validator import validate
+
+from services.api import create_app, create_server, problems
+from services.domain import errors
+from services.settings import Settings
+from services.store.sql import SqlStore
+
+
+def test_unknown_paths_and_methods(http: httpx.Client) -> None:
+    for path in ("/", "/v1", "/v1/nope", "/v2/jobs"):
+        assert_problem(http.get(path), 404, "not_found")
+    answer = http.delete("/v1/jobs")
+    assert_problem(answer, 405, "method_not_allowed")
+    assert answer.headers["allow"]
+    assert_problem(http.put("/healthz"), 405, "method_not_allowed")
+
+
+def test_request_ids(http: httpx.Client) -> None:
+    assert http.get("/healthz", headers={"X-Request-ID": "my-id.1"}).headers["x-request-id"] == "my-id.1"
+    made = http.get("/healthz", headers={"X-Request-ID": "bad id"}).headers["x-request-id"]
+    assert len(made) == 32
+    assert http.get("/healthz").headers["x-request-id"] != made
+    problem = assert_problem(http.get("/nope", headers={"X-Request-ID": "mine"}), 404, "not_found")
+    assert problem["request_id"] == "mine"
+
+
+def test_health(http: httpx.Client) -> None:
+    assert http.get("/healthz").json() == {"status": "ok"}
+    assert http.get("/readyz").json() == {"status": "ok"}
+
+
+def test_metrics(http: httpx.Client) -> None:
+    job_id = submit(http)
+    http.get(f"/v1/jobs/{job_id}")
+    http.get("/nothing/here")
+    answer = http.get("/metrics")
+    assert answer.headers["content-type"].startswith("text/plain")
+    text = answer.text
+    assert 'vipe_jobs{state="queued"}' in text
+    assert 'vipe_shards{state="leased"}' in text
+    count = "vipe_api_request_duration_seconds_count"
+    assert f'{count}{{method="GET",route="/v1/jobs/{{job_id}}",status="200"}}' in text
+    assert f'{count}{{method="POST",route="/v1/jobs",status="202"}}' in text
+    assert f'{count}{{method="GET",route="unmatched",status="404"}}' in text
+    assert job_id not in text
+
+
+def test_the_openapi_document(http: httpx.Client) -> None:
+    document = http.get("/openapi.json").json()
+    validate(document)
+    assert "HTTPValidationError" not in document["components"]["schemas"]
+    checked = 0
+    for path, operations in document["paths"].items():
+        for method, operation in operations.items():
+            for status, response in operation["responses"].items():
+                if not status.startswith("2"):
+                    assert list(response["content"]) == ["application/problem+json"], (path, method, status)
+                    checked += 1
+            if path.startswith("/v1/jobs/{job_id}"):
+                assert {"401", "404", "422"} <= set(operation["responses"])
+                assert operation["security"]
+    assert checked > 20
+    assert document["paths"]["/v1/jobs"]["post"]["responses"]["202"]["headers"]["Location"]
+
+
+def test_with_a_key(tmp_path: Path) -> None:
+    with running(f"sqlite:///{tmp_path}/store.db", "api_key=secret") as service:
+        for headers in ({}, {"Authorization": "Bearer wrong"}, {"Authorization": "Basic c2VjcmV0"}):
+            answer = httpx.get(f"{service.url}/v1/jobs", headers=headers)
+            assert_problem(answer, 401, "unauthorized")
+            assert answer.headers["www-authenticate"] == "Bearer"
+            assert_problem(httpx.post(f"{service.url}/v1/jobs", headers=headers, json={}), 401, "unauthorized")
+        right = {"Authorization": "Bearer secret"}
+        assert httpx.get(f"{service.url}/v1/jobs", headers=right).json() == {"items": [], "next_page_token": None}
+        assert httpx.get(f"{service.url}/healthz").status_code == 200
+
+
+def test_a_defect_is_a_problem_too(tmp_path: Path) -> None:
+    class BrokenStore(SqlStore):
+        def counts(self) -> dict[str, dict[str, int]]:
+            raise ZeroDivisionError("secret detail")
+
+        def ping(self) -> None:
+            raise errors.StoreUnavailable("the database does not answer; try again")
+
+    store = BrokenStore(f"sqlite:///{tmp_path}/store.db")
+    settings = Settings(port=0)
+    server = create_server(create_app(store, settings), settings)
+    thread = threading.Thread(target=server.run)
+    thread.start()
+    while not server.started:
+        time.sleep(0.01)
+    problem = assert_problem(httpx.get(f"{server.url}/metrics"), 500, "internal_error")
+    assert "secret" not in problem["detail"]
+    answer = httpx.get(f"{server.url}/readyz")
+    assert_problem(answer, 503, "store_unavailable")
+    assert answer.headers["retry-after"]
+    server.should_exit = True
+    thread.join(timeout=30)
+    assert not thread.is_alive()
+    store.close()
+
+
+def test_every_error_of_the_service_has_its_own_code() -> None:
+    found: list[type[errors.ServiceError]] = [errors.ServiceError]
+    for kind in found:
+        found += kind.__subclasses__()
+    ours = [e for e in found if e.__module__ in (errors.__name__, problems.__name__)]
+    assert len({e.code for e in ours}) == len(ours)
+    assert all(400 <= e.status < 600 for e in ours)
+
+
+def test_settings_come_from_the_environment(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv("VIPE_DATA_DIR", str(tmp_path))
+    monkeypatch.setenv("VIPE_INPUT_ROOTS", '["/data", "/more"]')
+    monkeypatch.setenv("VIPE_API_KEY", "hidden")
+    settings = Settings()
+    assert settings.database_url == f"sqlite:///{tmp_path}/vipe.db"
+    assert settings.scratch_dir == tmp_path / "scratch"
+    assert settings.input_roots == (Path("/data"), Path("/more"))
+    assert "hidden" not in repr(settings)
+    assert all(field.description for field in Settings.model_fields.values())
