@@ -1,0 +1,1 @@
+"""`vipectl`: annotate one video, run the service, talk to it, and use its output."""

@@ -1,0 +1,106 @@
+"""`vipectl annotate`: the engine on this machine, without the service."""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+if TYPE_CHECKING:
+    from vipe_core.annotation import Annotation
+    from vipe_core.pipeline import Annotator
+
+
+def annotate(
+    inputs: Annotated[list[Path], typer.Argument(metavar="INPUT...", help="Video files, or directories of images.")],
+    output: Annotated[
+        Path, typer.Option("-o", "--output", metavar="OUT", help="Gets pose/, intrinsics/, depth/, rgb/.")
+    ],
+    preset: Annotated[str, typer.Option(help="Which components do the work.")] = "classical",
+    camera: Annotated[str, typer.Option(help="Camera model.")] = "pinhole",
+    device: Annotated[str, typer.Option(help="cpu or cuda.")] = "cpu",
+    as_json: Annotated[bool, typer.Option("--json", help="One JSON line per input on stdout, nothing else.")] = False,
+) -> None:
+    """Annotate videos here: poses, intrinsics and dense depth in ViPE's artifact layout."""
+    from rich.console import Console
+
+    from vipe_core.errors import VipeError
+    from vipe_core.formats import SequenceNames
+    from vipe_core.pipeline import Annotator
+
+    console = Console(stderr=True, quiet=as_json)
+    annotator = Annotator(preset=preset, camera=camera, device=device)
+    names = SequenceNames(output)
+    rows: list[dict[str, Any]] = []
+    for path in inputs:
+        started = time.perf_counter()
+        try:
+            row = _annotate_one(annotator, path, output, names.name_for(path), console)
+            row["seconds"] = round(time.perf_counter() - started, 3)
+            row["frames_per_s"] = round(row["num_frames"] / row["seconds"], 3)
+        except VipeError as error:
+            row = {"input": str(path), "error": {"code": error.code, "message": str(error)}}
+            console.print(f"[red]{path}: {error} \\[{error.code}]", highlight=False)
+        rows.append(row)
+        if as_json:
+            sys.stdout.write(json.dumps(row) + "\n")
+            sys.stdout.flush()
+    done = [row for row in rows if "error" not in row]
+    if done and not as_json:
+        from services.cli.tables import annotation_table
+
+        Console().print(annotation_table(done))
+        Console().print(f"Written to {output.resolve()}", highlight=False)
+    if len(done) < len(rows):
+        raise typer.Exit(1)
+
+
+def _annotate_one(annotator: Annotator, path: Path, output: Path, name: str, console: Any) -> dict[str, Any]:
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+    from vipe_core.annotation import Progress as EngineProgress
+    from vipe_core.formats import write_artifacts
+
+    columns = (
+        TextColumn("{task.fields[video]}"),
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+    )
+    with Progress(*columns, console=console, transient=True) as bars:
+        task = bars.add_task("opening", video=path.name, total=None)
+
+        def report(progress: EngineProgress) -> None:
+            bars.update(task, description=progress.stage, completed=progress.frames_done, total=progress.frames_total)
+
+        annotation = annotator.annotate(path, name=name, progress=report)
+
+        def written(done: int, total: int) -> None:
+            bars.update(task, description="depth", completed=done, total=total)
+
+        write_artifacts(annotation, output, progress=written)
+    return _row(path, annotation, output)
+
+
+def _row(path: Path, annotation: Annotation, output: Path) -> dict[str, Any]:
+    return {
+        "input": str(path),
+        "name": annotation.name,
+        "output": str(output),
+        "num_frames": annotation.num_frames,
+        "num_keyframes": len(annotation.keyframes),
+        "width": annotation.camera.width,
+        "height": annotation.camera.height,
+        "camera_model": annotation.camera.model,
+        "camera_params": list(annotation.camera.params),
+        "fov_x_deg": round(annotation.camera.fov_x_deg, 4),
+        "trajectory_length": round(annotation.trajectory_length, 6),
+        "scale": annotation.scale,
+        "quality": annotation.quality.summary(),
+        "timings_s": {stage: round(seconds, 3) for stage, seconds in annotation.timings_s.items()},
+    }

@@ -1,0 +1,82 @@
+"""`vipectl verify | unpack | export`: the output of a job, read through its commit records."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import typer
+
+if TYPE_CHECKING:
+    from services.dataset import Report
+
+Endpoint = Annotated[
+    str | None, typer.Option("--s3-endpoint", envvar="VIPE_S3_ENDPOINT_URL", help="S3 endpoint, if not AWS.")
+]
+Source = Annotated[str, typer.Argument(metavar="OUTPUT", help="A job's output: a directory or s3://bucket/prefix.")]
+
+
+def verify(
+    output: Source,
+    deep: Annotated[bool, typer.Option("--deep", help="Also read every tar: sha256, members, keys.")] = False,
+    endpoint: Endpoint = None,
+) -> None:
+    """Prove that an output is complete: every video committed or failed, every object there. Exit code 1 if not."""
+    from services.dataset import verify as check
+    from services.storage import open_store
+
+    report = check(open_store(output, endpoint_url=endpoint), deep=deep)
+    typer.echo(summary(report))
+    for problem in report.problems:
+        typer.echo(f"  {problem}", err=True)
+    if not report.ok:
+        raise typer.Exit(report.exit_code)
+
+
+def summary(report: Report) -> str:
+    """One line: what was counted and whether anything is wrong."""
+    totals = report.totals
+    verdict = "complete" if report.ok else f"{len(report.problems)} PROBLEMS"
+    return (
+        f"{verdict}: {totals.videos} videos = {totals.succeeded} succeeded + {totals.failed} failed"
+        f" + {totals.quarantined} quarantined, {totals.frames} frames, {totals.shards} shards"
+    )
+
+
+def unpack(
+    output: Source,
+    destination: Annotated[Path, typer.Argument(metavar="DEST", help="Gets pose/, intrinsics/, depth/, rgb/.")],
+    key: Annotated[list[str] | None, typer.Option("--key", help="Only these videos.")] = None,
+    endpoint: Endpoint = None,
+) -> None:
+    """Unpack tars into the directory layout that nvidia-vipe's own tools read."""
+    from services.dataset import unpack as unpack_dataset
+    from services.storage import open_store
+
+    unpacked = unpack_dataset(open_store(output, endpoint_url=endpoint), destination, keys=key)
+    typer.echo(f"{len(unpacked.names)} videos unpacked to {destination}")
+
+
+def export(
+    source: Annotated[str, typer.Argument(metavar="SOURCE", help="A job's output, or a folder of artifacts.")],
+    destination: Annotated[Path, typer.Argument(metavar="DEST", help="Gets one file per video.")],
+    format: Annotated[Literal["npz"], typer.Option("--format", help="npz: one file of arrays per video.")] = "npz",
+    key: Annotated[list[str] | None, typer.Option("--key", help="Only these videos.")] = None,
+    depth_stride: Annotated[int, typer.Option(min=1, help="Keep every n-th depth pixel per axis.")] = 4,
+    endpoint: Endpoint = None,
+) -> None:
+    """Export poses, intrinsics and depth to one file per video."""
+    import tempfile
+
+    from services.dataset import unpack as unpack_dataset
+    from services.storage import open_store
+    from vipe_core.formats import export_npz, list_sequences
+
+    with tempfile.TemporaryDirectory(prefix="vipe-export-") as scratch:
+        folder = Path(source)
+        if not (folder / "pose").is_dir():
+            folder = Path(scratch)
+            unpack_dataset(open_store(source, endpoint_url=endpoint), folder, keys=key)
+        names = [name for name in list_sequences(folder) if not key or name in key]
+        for name in names:
+            typer.echo(export_npz(folder, name, destination / f"{name}.{format}", depth_stride=depth_stride))

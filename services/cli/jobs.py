@@ -1,0 +1,134 @@
+"""`vipectl submit | jobs | status | watch | videos | cancel`: the service over REST."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+if TYPE_CHECKING:
+    from services.client import Client
+
+ApiUrl = Annotated[str, typer.Option("--api", envvar="VIPE_API_URL", help="Address of the service.")]
+ApiKey = Annotated[
+    str | None, typer.Option("--api-key", envvar="VIPE_API_KEY", help="Bearer key, where the service asks.")
+]
+AsJson = Annotated[bool, typer.Option("--json", help="The service's JSON instead of a table.")]
+DEFAULT_API = "http://127.0.0.1:8080"
+
+
+def _client(api: str, api_key: str | None) -> Client:
+    from services.client import Client
+
+    return Client(api, api_key=api_key)
+
+
+def _address(text: str) -> str:
+    """Local paths become absolute, so that the service reads the same file; addresses with a scheme stay."""
+    return text if "://" in text else str(Path(text).expanduser().resolve()) + ("/" if text.endswith("/") else "")
+
+
+def _print_json(value: Any) -> None:
+    sys.stdout.write(json.dumps(value, indent=2) + "\n")
+
+
+def submit(
+    inputs: Annotated[list[str], typer.Argument(metavar="INPUT...", help="Videos, directories, s3://bucket/prefix/.")],
+    output: Annotated[
+        str, typer.Option("-o", "--output", metavar="OUT", help="Directory or s3://bucket/prefix of this job.")
+    ],
+    preset: str = "classical",
+    camera: str = "pinhole",
+    name: str = "",
+    key: Annotated[
+        str | None, typer.Option("--idempotency-key", help="The same key and job is never run twice.")
+    ] = None,
+    wait: Annotated[bool, typer.Option("--wait", help="Show progress until the job ends.")] = False,
+    api: ApiUrl = DEFAULT_API,
+    api_key: ApiKey = None,
+    as_json: AsJson = False,
+) -> None:
+    """Submit a job to a running service."""
+    client = _client(api, api_key)
+    spec = {
+        "inputs": [_address(item) for item in inputs],
+        "output": _address(output).rstrip("/"),
+        "preset": preset,
+        "camera": camera,
+        "name": name,
+    }
+    job = client.submit(spec, idempotency_key=key)
+    if as_json:
+        _print_json(job)
+    else:
+        typer.echo(job["id"])
+    if wait:
+        _watch(client, job["id"])
+
+
+def list_jobs(limit: int = 20, api: ApiUrl = DEFAULT_API, api_key: ApiKey = None, as_json: AsJson = False) -> None:
+    """List jobs, newest first."""
+    from rich.console import Console
+    from rich.table import Table
+
+    found = _client(api, api_key).jobs(limit=limit)
+    if as_json:
+        _print_json(found)
+        return
+    table = Table(
+        "job", "state", "videos", "failed", "frames", "created", "output", show_edge=False, header_style="bold"
+    )
+    for job in found:
+        progress = job["progress"]
+        settled = progress["videos_succeeded"] + progress["videos_failed"] + progress["videos_quarantined"]
+        failed = progress["videos_failed"] + progress["videos_quarantined"]
+        counts = (f"{settled}/{progress['videos_total']}", str(failed), str(progress["frames_done"]))
+        table.add_row(job["id"], job["state"], *counts, job["created_at"], job["spec"]["output"])
+    Console().print(table)
+
+
+def status(job_id: str, api: ApiUrl = DEFAULT_API, api_key: ApiKey = None) -> None:
+    """Show one job as JSON."""
+    _print_json(_client(api, api_key).job(job_id))
+
+
+def watch(job_id: str, api: ApiUrl = DEFAULT_API, api_key: ApiKey = None) -> None:
+    """Show progress until the job ends; exit code 1 unless it succeeded without errors."""
+    _watch(_client(api, api_key), job_id)
+
+
+def _watch(client: Client, job_id: str) -> None:
+    from services.cli.progress import show_progress
+
+    job = show_progress(client, job_id)
+    typer.echo(f"{job_id} {job['state']}" + (f": {job['error_message']}" if job.get("error_message") else ""))
+    if job["state"] != "succeeded":
+        raise typer.Exit(1)
+
+
+def videos(
+    job_id: str,
+    status: Annotated[str | None, typer.Option(help="pending, succeeded, failed or quarantined.")] = None,
+    api: ApiUrl = DEFAULT_API,
+    api_key: ApiKey = None,
+    as_json: AsJson = False,
+) -> None:
+    """List the videos of a job with their results."""
+    found = _client(api, api_key).videos(job_id, status=status)
+    if as_json:
+        for video in found:
+            sys.stdout.write(json.dumps(video) + "\n")
+        return
+    from rich.console import Console
+
+    from services.cli.tables import annotation_table
+
+    Console().print(annotation_table(video for video in found if video["status"] != "pending"))
+
+
+def cancel(job_id: str, api: ApiUrl = DEFAULT_API, api_key: ApiKey = None) -> None:
+    """Cancel a job; what is committed stays."""
+    typer.echo(_client(api, api_key).cancel(job_id)["state"])

@@ -1,0 +1,82 @@
+"""The command-line program. Each command imports what it needs when it runs, so that `--help` is instant."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from functools import wraps
+from typing import Annotated, ParamSpec, TypeVar
+
+import typer
+
+from services.cli import annotate, data, demo, jobs, serve
+
+P = ParamSpec("P")
+R = TypeVar("R")
+
+app = typer.Typer(
+    name="vipectl",
+    help="Camera poses, intrinsics and dense depth from any raw video: on this machine, or on a Ray cluster.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,
+)
+
+
+def _version(show: bool) -> None:
+    if show:
+        from importlib.metadata import version
+
+        typer.echo(f"vipectl {version('vipe-cluster')}")
+        raise typer.Exit
+
+
+@app.callback()
+def root(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version.")
+    ] = False,
+) -> None:
+    """Camera poses, intrinsics and dense depth from any raw video."""
+
+
+def _typed_errors(command: Callable[P, R]) -> Callable[P, R]:
+    """The project's own errors become one line on stderr and exit code 1; others show their trace."""
+
+    @wraps(command)
+    def run(*args: P.args, **kwargs: P.kwargs) -> R:
+        from services.client import ApiError
+        from services.domain.errors import ServiceError
+        from vipe_core.errors import VipeError
+
+        try:
+            return command(*args, **kwargs)
+        except (VipeError, ServiceError, ApiError) as error:
+            typer.echo(f"vipectl: {error} [{error.code}]", err=True)
+            raise typer.Exit(1) from None
+        except KeyboardInterrupt:
+            raise typer.Exit(130) from None
+
+    return run
+
+
+_ENGINE, _SERVICE, _DATA = "Annotate here", "Run and use the service", "Use the output"
+
+app.command("annotate", rich_help_panel=_ENGINE)(_typed_errors(annotate.annotate))
+app.command("demo", rich_help_panel=_ENGINE)(_typed_errors(demo.demo))
+app.command("up", rich_help_panel=_SERVICE)(_typed_errors(serve.up))
+app.command("api", rich_help_panel=_SERVICE)(_typed_errors(serve.api))
+app.command("agent", rich_help_panel=_SERVICE)(_typed_errors(serve.agent))
+app.command("submit", rich_help_panel=_SERVICE)(_typed_errors(jobs.submit))
+app.command("jobs", rich_help_panel=_SERVICE)(_typed_errors(jobs.list_jobs))
+app.command("status", rich_help_panel=_SERVICE)(_typed_errors(jobs.status))
+app.command("watch", rich_help_panel=_SERVICE)(_typed_errors(jobs.watch))
+app.command("videos", rich_help_panel=_SERVICE)(_typed_errors(jobs.videos))
+app.command("cancel", rich_help_panel=_SERVICE)(_typed_errors(jobs.cancel))
+app.command("verify", rich_help_panel=_DATA)(_typed_errors(data.verify))
+app.command("unpack", rich_help_panel=_DATA)(_typed_errors(data.unpack))
+app.command("export", rich_help_panel=_DATA)(_typed_errors(data.export))
+
+if __name__ == "__main__":
+    sys.exit(app())

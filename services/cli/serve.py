@@ -1,0 +1,138 @@
+"""`vipectl up | api | agent`: the service as one process, or its two halves."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import os
+import signal
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+if TYPE_CHECKING:
+    from services.observability.metrics import Metrics
+    from services.settings import Settings
+    from services.store.sql import SqlStore
+
+logger = logging.getLogger(__name__)
+
+# Nobody else takes the leases of an embedded service over; after a crash a short lease means a short wait.
+_EMBEDDED_LEASE_TTL_S = 20.0
+
+Host = Annotated[str | None, typer.Option(help="Address to listen on.")]
+Port = Annotated[int | None, typer.Option(help="Port of the API; 0 takes a free one.")]
+DataDir = Annotated[Path | None, typer.Option(help="Folder of the database and scratch files.")]
+Slots = Annotated[int | None, typer.Option(help="Worker processes; one video in each.")]
+Device = Annotated[str | None, typer.Option(help="cpu or cuda.")]
+Database = Annotated[str | None, typer.Option("--database-url", help="sqlite:///... or postgresql+psycopg://...")]
+
+
+def up(
+    host: Host = None,
+    port: Port = None,
+    data_dir: DataDir = None,
+    slots: Slots = None,
+    device: Device = None,
+    database_url: Database = None,
+) -> None:
+    """Run the whole service in this process: API, SQLite, a local Ray. Ctrl-C stops it; started again, it goes on."""
+    settings = _settings(
+        host=host, port=port, data_dir=data_dir, num_slots=slots, device=device, database_url=database_url
+    )
+    if "lease_ttl_s" not in settings.model_fields_set:
+        settings = settings.model_copy(update={"lease_ttl_s": _EMBEDDED_LEASE_TTL_S})
+    with _open_store(settings) as store:
+        metrics = _metrics()
+        with _running_agent(store, settings, metrics):
+            _serve_api(store, settings, metrics)
+
+
+def api(host: Host = None, port: Port = None, database_url: Database = None) -> None:
+    """Run the API alone; agents elsewhere share its database."""
+    settings = _settings(host=host, port=port, database_url=database_url)
+    with _open_store(settings) as store:
+        _serve_api(store, settings, _metrics())
+
+
+def agent(
+    slots: Slots = None,
+    device: Device = None,
+    database_url: Database = None,
+    metrics_host: Annotated[str, typer.Option(help="Address of /metrics.")] = "127.0.0.1",
+    metrics_port: Annotated[int, typer.Option(help="Port of /metrics; 0 takes a free one.")] = 9090,
+) -> None:
+    """Run an agent alone: it leases shards and runs them on Ray (VIPE_RAY_ADDRESS, or a private one)."""
+    settings = _settings(num_slots=slots, device=device, database_url=database_url)
+    metrics = _metrics()
+    stop = threading.Event()
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, lambda *_: stop.set())
+    with _open_store(settings) as store, _running_agent(store, settings, metrics):
+        server, _ = metrics.serve(metrics_port, metrics_host)
+        logger.info("metrics on http://%s:%d/metrics", metrics_host, server.server_port)
+        stop.wait()
+
+
+def _settings(**overrides: Any) -> Settings:
+    """Settings from the environment (`VIPE_*`), overridden by what the command line names."""
+    from pydantic import ValidationError
+
+    from services.observability.logging import configure_logging
+    from services.settings import Settings
+
+    try:
+        settings = Settings(**{name: value for name, value in overrides.items() if value is not None})
+    except ValidationError as error:
+        first = error.errors()[0]
+        name = ".".join(map(str, first["loc"]))
+        raise typer.BadParameter(f"{name} (VIPE_{name.upper()}): {first['msg']}") from None
+    configure_logging(settings.log_level, settings.log_format)
+    return settings
+
+
+def _metrics() -> Metrics:
+    from services.observability.metrics import Metrics
+
+    return Metrics()
+
+
+@contextlib.contextmanager
+def _open_store(settings: Settings) -> Iterator[SqlStore]:
+    from services.store.sql import SqlStore
+
+    settings.data_dir.mkdir(parents=True, exist_ok=True)
+    store = SqlStore(settings.database_url)
+    try:
+        yield store
+    finally:
+        store.close()
+
+
+@contextlib.contextmanager
+def _running_agent(store: SqlStore, settings: Settings, metrics: Metrics) -> Iterator[None]:
+    from services.agent.agent import Agent
+    from services.agent.config import config_from_settings
+    from services.agent.ray_executor import RayExecutor
+
+    config = config_from_settings(settings)
+    running = Agent(store, config, RayExecutor(config), metrics)
+    running.start()
+    try:
+        yield
+    finally:
+        running.stop()
+
+
+def _serve_api(store: SqlStore, settings: Settings, metrics: Metrics) -> None:
+    from services.api import create_app, create_server
+
+    server = create_server(create_app(store, settings, metrics), settings)
+    # uvicorn raises the signal again once it has stopped; the process must live on to stop the agent.
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, lambda *_: None)
+    logger.info("API on http://%s:%d, process %d", settings.host, settings.port, os.getpid())
+    server.run()

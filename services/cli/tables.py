@@ -1,0 +1,63 @@
+"""Tables for people: one row per video."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+from rich.table import Table
+from rich.text import Text
+
+_VERDICT_STYLE = {"yes": "green", "doubtful": "yellow", "no": "red"}
+
+
+def _quality(quality: Mapping[str, Any] | None) -> Text:
+    if not quality:
+        return Text("-")
+    verdict = str(quality["reliable"])
+    reasons = ", ".join(quality["reasons"])
+    text = verdict if not reasons else f"{verdict}: {reasons}"
+    return Text(text, style=_VERDICT_STYLE.get(verdict, ""))
+
+
+def annotation_table(
+    rows: Iterable[Mapping[str, Any]], scores: Mapping[str, Mapping[str, float]] | None = None
+) -> Table:
+    """Rows have the fields of `VideoResult` (or of `vipectl annotate --json`).
+
+    Args:
+        rows: Succeeded and failed videos; a failed one shows its error across the columns.
+        scores: Key -> {ate_pct, fov_err_deg} for videos with ground truth; adds two columns.
+    """
+    table = Table(show_edge=False, pad_edge=False, header_style="bold")
+    table.add_column("video", overflow="fold")
+    for title in ("frames", "size", "seconds", "frames/s", "focal px", "FOV", "path"):
+        table.add_column(title, justify="right", no_wrap=True)
+    if scores:
+        table.add_column("ATE", justify="right", no_wrap=True)
+        table.add_column("FOV err", justify="right", no_wrap=True)
+    table.add_column("reliable")
+    for row in rows:
+        name = str(row.get("name") or row.get("key"))
+        if row.get("error_code"):
+            blanks = [""] * (7 + (2 if scores else 0))
+            table.add_row(name, *blanks, Text(f"{row['status']}: {row['error_code']}", style="red"))
+            continue
+        frames, seconds = row["num_frames"], row["seconds"]
+        focal = f"{row['camera_params'][0]:.1f}" if row["camera_params"] else "-"
+        unit = " m" if row["scale"] == "metric" else ""
+        cells = [
+            name,
+            str(frames),
+            f"{row['width']}x{row['height']}",
+            f"{seconds:.1f}",
+            f"{frames / seconds:.2f}",
+            focal,
+            f"{row['fov_x_deg']:.1f}°",
+            f"{row['trajectory_length']:.2f}{unit}",
+        ]
+        if scores:
+            score = scores.get(name)
+            cells += ["-", "-"] if score is None else [f"{score['ate_pct']:.2f}%", f"{score['fov_err_deg']:.2f}°"]
+        table.add_row(*cells, _quality(row.get("quality")))
+    return table

@@ -1,0 +1,226 @@
+"""The deployment files agree with the code: names of metrics, settings, commands, images and versions.
+
+No container engine and no cluster take part; what is checked is everything that can drift without one.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import shlex
+import shutil
+import subprocess
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+from typer.main import get_command
+
+from services.cli.main import app
+from services.observability.metrics import Metrics
+from services.settings import Settings
+
+ROOT = Path(__file__).resolve().parents[2]
+DEPLOY = ROOT / "deploy"
+DOCKERFILE = (ROOT / "docker/Dockerfile").read_text()
+
+
+def exported_series() -> set[str]:
+    """Every sample name that a scrape can show."""
+    names = set()
+    for family in Metrics().registry.collect():
+        suffixes = {"counter": ["_total"], "histogram": ["_bucket", "_sum", "_count"]}.get(family.type, [""])
+        names |= {family.name + suffix for suffix in suffixes}
+    return names
+
+
+def dashboard() -> Any:
+    return json.loads((DEPLOY / "grafana/dashboards/vipe.json").read_text())
+
+
+def alert_rules() -> Iterator[dict[str, Any]]:
+    for group in yaml.safe_load((DEPLOY / "prometheus/alerts.yaml").read_text())["groups"]:
+        yield from group["rules"]
+
+
+def expressions() -> list[str]:
+    panels = [target["expr"] for panel in dashboard()["panels"] for target in panel.get("targets", [])]
+    return panels + [rule["expr"] for rule in alert_rules()]
+
+
+def manifests() -> list[dict[str, Any]]:
+    files = [path for path in sorted((DEPLOY / "kuberay").glob("*.yaml")) if path.name != "kustomization.yaml"]
+    return [document for path in files for document in yaml.safe_load_all(path.read_text())]
+
+
+def compose() -> Any:
+    return yaml.safe_load((DEPLOY / "compose/compose.yaml").read_text())
+
+
+def test_dashboard_and_alerts_use_only_exported_metrics() -> None:
+    exported = exported_series()
+    used = {name for expr in expressions() for name in re.findall(r"\bvipe_[a-z_]+", expr)}
+    assert len(used) > 10
+    assert used <= exported, f"not exported by the service: {sorted(used - exported)}"
+
+
+def test_dashboard_labels_exist() -> None:
+    labels = {label for family in Metrics().registry.collect() for label in family_labels(family.name)}
+    for expr in expressions():
+        for group in re.findall(r"by \(([^)]*)\)", expr):
+            assert {label.strip() for label in group.split(",")} <= labels | {"le"}, expr
+
+
+def family_labels(name: str) -> tuple[str, ...]:
+    for metric in vars(Metrics()).values():
+        if getattr(metric, "_name", None) == name:
+            return tuple(metric._labelnames)
+    return ()
+
+
+def test_dashboard_panels_are_provisioned_and_do_not_overlap() -> None:
+    board = dashboard()
+    assert board["uid"] == "vipe"
+    assert len({panel["id"] for panel in board["panels"]}) == len(board["panels"])
+    cells = [
+        (x, y)
+        for panel in board["panels"]
+        for x in range(panel["gridPos"]["x"], panel["gridPos"]["x"] + panel["gridPos"]["w"])
+        for y in range(panel["gridPos"]["y"], panel["gridPos"]["y"] + panel["gridPos"]["h"])
+    ]
+    assert len(cells) == len(set(cells))
+    provider = yaml.safe_load((DEPLOY / "grafana/provisioning/dashboards/vipe.yaml").read_text())["providers"][0]
+    assert f"../grafana/dashboards:{provider['options']['path']}:ro" in compose()["services"]["grafana"]["volumes"]
+
+
+def container_environments() -> Iterator[tuple[str, str]]:
+    for name, service in compose()["services"].items():
+        for variable in service.get("environment", {}):
+            yield f"compose {name}", variable
+    for document in manifests():
+        if document["kind"] == "ConfigMap":
+            for variable in document["data"]:
+                yield "settings.yaml", variable
+        for container in containers(document):
+            for variable in container.get("env", []):
+                yield document["metadata"]["name"], variable["name"]
+    for variable in re.findall(r"\b(VIPE_[A-Z_0-9]+)=", DOCKERFILE):
+        yield "Dockerfile", variable
+
+
+def containers(document: Any) -> Iterator[dict[str, Any]]:
+    if isinstance(document, dict):
+        yield from document.get("containers", [])
+        for value in document.values():
+            yield from containers(value)
+    elif isinstance(document, list):
+        for value in document:
+            yield from containers(value)
+
+
+def test_every_setting_in_a_container_is_one_that_the_service_reads() -> None:
+    known = {f"VIPE_{field.upper()}" for field in Settings.model_fields}
+    used = [(where, variable) for where, variable in container_environments() if variable.startswith("VIPE_")]
+    assert len(used) > 8
+    for where, variable in used:
+        assert variable in known, f"{where} sets {variable}, which nothing reads"
+
+
+def shell_commands() -> list[list[str]]:
+    images = [json.loads(line) for line in re.findall(r"^CMD (\[.*\])$", DOCKERFILE, re.M)]
+    pods = [
+        shlex.split(container["command"][-1].split("exec ")[-1])
+        for document in manifests()
+        for container in containers(document)
+        if container.get("command")
+    ]
+    return [command for command in images + pods if command[0] == "vipectl"]
+
+
+def test_container_commands_exist_in_the_program() -> None:
+    program = get_command(app)
+    commands = shell_commands()
+    assert len(commands) == 4
+    for _, name, *arguments in commands:
+        subcommand = program.commands[name]  # type: ignore[attr-defined]
+        with subcommand.make_context(name, arguments):
+            pass  # click parsed every option
+
+
+def test_compose_builds_targets_that_the_dockerfile_has() -> None:
+    stages = set(re.findall(r"^FROM \S+ AS (\S+)$", DOCKERFILE, re.M))
+    gpu = yaml.safe_load((DEPLOY / "compose/gpu.yaml").read_text())
+    builds = [
+        service["build"] for file in (compose(), gpu) for service in file["services"].values() if "build" in service
+    ]
+    assert len(builds) == 4
+    for build in builds:
+        assert build["target"] in stages
+    for name, service in compose()["services"].items():
+        for dependency in service.get("depends_on", {}):
+            assert dependency in compose()["services"], f"{name} depends on {dependency}"
+
+
+def test_dockerfile_copies_what_the_context_lets_through() -> None:
+    allowed = {line[1:] for line in (ROOT / ".dockerignore").read_text().splitlines() if line.startswith("!")}
+    for sources in re.findall(r"^COPY (.+) \S+$", DOCKERFILE, re.M):
+        for source in sources.split():
+            assert source.strip("./") in allowed
+            assert (ROOT / source).exists()
+
+
+def test_prometheus_scrapes_ports_that_the_images_open() -> None:
+    scrapes = yaml.safe_load((DEPLOY / "prometheus/prometheus.yaml").read_text())["scrape_configs"]
+    targets = {target for scrape in scrapes for static in scrape["static_configs"] for target in static["targets"]}
+    for target in targets:
+        service, port = target.split(":")
+        stage = compose()["services"][service]["build"]["target"]
+        body = DOCKERFILE.split(f" AS {stage}\n")[1].split("FROM ")[0]
+        assert f"EXPOSE {port}" in body
+
+
+def test_cluster_runs_the_ray_of_the_lock() -> None:
+    locked = re.search(r"^ray==(\S+)$", (ROOT / "requirements.lock").read_text(), re.M)
+    cluster = next(document for document in manifests() if document["kind"] == "RayCluster")
+    assert locked is not None
+    assert cluster["spec"]["rayVersion"] == locked[1]
+    assert cluster["spec"]["headGroupSpec"]["rayStartParams"]["num-cpus"] == "0"
+    agent = next(document for document in manifests() if document["metadata"]["name"] == "vipe-agent")
+    assert (
+        f"{cluster['metadata']['name']}-head-svc:6379"
+        in agent["spec"]["template"]["spec"]["containers"][0]["command"][-1]
+    )
+
+
+def test_pods_run_unprivileged() -> None:
+    for document in manifests():
+        for template in pod_specs(document):
+            assert template["securityContext"]["runAsNonRoot"] is True, document["metadata"]["name"]
+
+
+def pod_specs(document: Any) -> Iterator[dict[str, Any]]:
+    if isinstance(document, dict):
+        if "containers" in document:
+            yield document
+        for value in document.values():
+            yield from pod_specs(value)
+    elif isinstance(document, list):
+        for value in document:
+            yield from pod_specs(value)
+
+
+def test_kustomize_renders_with_tagged_images() -> None:
+    kubectl = shutil.which("kubectl")
+    if kubectl is None:
+        pytest.skip("kubectl is not installed: the kustomization was parsed, not rendered")
+    rendered = subprocess.run(
+        [kubectl, "kustomize", str(DEPLOY / "kuberay")], check=True, capture_output=True, text=True
+    ).stdout
+    documents = list(yaml.safe_load_all(rendered))
+    assert {document["kind"] for document in documents} == {
+        "Namespace", "ConfigMap", "Deployment", "Service", "RayCluster",
+    }  # fmt: skip
+    images = {container["image"] for document in documents for container in containers(document)}
+    assert images == {"vipe-api:0.1.0", "vipe-worker:0.1.0-gpu"}
