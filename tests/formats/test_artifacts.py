@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import pickle
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -88,6 +89,34 @@ def test_reading_gives_the_annotation_back(tmp_path: Path, model: str) -> None:
     assert artifacts.info["keyframes"] == [0, 6]
     assert artifacts.info["provenance"]["config_hash"] == "abc"
     assert "timings_s" not in artifacts.info
+
+
+@pytest.mark.parametrize("model", ["pinhole", "mei"])
+def test_distances_become_z_on_disk(tmp_path: Path, model: str) -> None:
+    annotation = replace(make_annotation(model, 2), depth_kind="ray")
+    write_artifacts(annotation, tmp_path, attributes=("pose", "intrinsics", "depth"))
+    artifacts = read_artifacts(tmp_path, "clip")
+    assert artifacts.depth_kind == artifacts.info["depth_kind"] == "z"
+    fx, fy, cx, cy, *alpha = annotation.camera.params
+    a = alpha[0] if alpha else 0.0
+    y, x = np.mgrid[:HEIGHT, :WIDTH] + 0.5
+    r2 = ((x - cx) / fx) ** 2 + ((y - cy) / fy) ** 2
+    # z of the unit ray of the unified model (a = 0 is the pinhole).
+    z = (a + np.sqrt(1 + (1 - a * a) * r2)) / (1 + r2) - a
+    with artifacts.open_depth() as reader:
+        assert np.allclose(reader.read(1), depth_of(1) * z, rtol=1e-3)
+
+
+def test_z_of_a_panorama_becomes_distance_ahead_and_nothing_behind(tmp_path: Path) -> None:
+    annotation = replace(make_annotation("equirect", 1), depth_kind="z")
+    write_artifacts(annotation, tmp_path, attributes=("pose", "intrinsics", "depth"))
+    with read_artifacts(tmp_path, "clip").open_depth() as reader:
+        depth = reader.read(0)
+    v, u = HEIGHT // 2, WIDTH // 2 + 2
+    angle = (u + 0.5 - WIDTH / 2) / WIDTH * 2 * np.pi
+    elevation = (v + 0.5 - HEIGHT / 2) / HEIGHT * np.pi
+    assert depth[v, u] == pytest.approx(depth_of(0)[v, u] / (np.cos(angle) * np.cos(elevation)), rel=1e-3)
+    assert depth[:, : WIDTH // 4].max() == 0
 
 
 def test_two_writes_give_the_same_bytes(tmp_path: Path) -> None:

@@ -19,8 +19,8 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from vipe_core.annotation import Annotation, DenseFrame
-from vipe_core.cameras import Camera
+from vipe_core.annotation import Annotation, DenseFrame, DepthKind
+from vipe_core.cameras import Camera, CameraModel
 from vipe_core.errors import EngineError
 from vipe_core.formats.depth_zip import DepthZipWriter
 from vipe_core.formats.layout import artifact_path, info_path
@@ -31,6 +31,8 @@ Attribute = Literal["pose", "intrinsics", "depth", "rgb"]
 ALL_ATTRIBUTES: tuple[Attribute, ...] = ("pose", "intrinsics", "depth", "rgb")
 
 INFO_SCHEMA = 1
+# What a depth value means on disk is fixed by the camera: along the axis, except for panoramas.
+DISK_DEPTH_KINDS: dict[CameraModel, DepthKind] = {"pinhole": "z", "mei": "z", "equirect": "ray"}
 DISK_CAMERA_NAMES = {"pinhole": "PINHOLE", "mei": "MEI", "equirect": "PANORAMA"}
 
 
@@ -63,7 +65,8 @@ def write_artifacts(
     """Write `annotation` below `root`, consuming its dense stream once (not at all without `depth` and `rgb`).
 
     An earlier result of the same name is replaced: first its `_info.json` goes, then files change, then the new
-    `_info.json` appears, so that its presence always means a complete sequence.
+    `_info.json` appears, so that its presence always means a complete sequence. Depth is converted to what ViPE's
+    files hold: z for pinhole and mei, distance for panoramas.
 
     Args:
         annotation: Its name must be a sanitised one.
@@ -112,6 +115,20 @@ def disk_intrinsics(camera: Camera) -> NDArray[np.float32]:
     return np.array(camera.params or (0.0, 0.0, 0.0, 0.0), dtype=np.float32)
 
 
+def disk_depth_factor(camera: Camera, kind: DepthKind) -> NDArray[np.float32] | None:
+    """(H, W) factor from depth of `kind` to the kind that lies on disk; None where they are the same.
+
+    0 where there is no such depth: a pixel at or beyond 90 degrees has no depth along the axis.
+    """
+    if kind == DISK_DEPTH_KINDS[camera.model]:
+        return None
+    rays = camera.rays()
+    z_per_distance = rays[..., 2] / np.linalg.norm(rays, axis=-1)
+    ahead = z_per_distance > 0
+    factor = z_per_distance if kind == "ray" else 1 / np.where(ahead, z_per_distance, 1)
+    return np.where(ahead, factor, 0).astype(np.float32)
+
+
 def _write_all(
     annotation: Annotation,
     work: Path,
@@ -150,13 +167,14 @@ def _write_dense(
 ) -> None:
     total = annotation.num_frames
     done = 0
+    factor = disk_depth_factor(annotation.camera, annotation.depth_kind)
     with ExitStack() as stack:
         depth = stack.enter_context(DepthZipWriter(depth_path)) if depth_path else None
         rgb = stack.enter_context(VideoWriter(rgb_path, annotation.fps)) if rgb_path else None
         for frame in annotation.dense():
             _check_dense(annotation, frame, done)
             if depth is not None:
-                depth.append(frame.depth)
+                depth.append(frame.depth if factor is None else frame.depth * factor)
             if rgb is not None:
                 rgb.write(frame.rgb)
             done += 1
@@ -188,7 +206,7 @@ def _info_json(annotation: Annotation, attributes: Sequence[Attribute]) -> str:
         "camera": {"model": camera.model, "params": list(camera.params), "fov_x_deg": round(camera.fov_x_deg, 6)},
         "fps": annotation.fps,
         "scale": annotation.scale,
-        "depth_kind": annotation.depth_kind,
+        "depth_kind": DISK_DEPTH_KINDS[camera.model],
         "trajectory_length": annotation.trajectory_length,
         "quality": annotation.quality.summary(),
         "frame_inlier_ratio": [round(float(value), 4) for value in annotation.quality.frame_inlier_ratio],

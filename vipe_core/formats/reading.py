@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from vipe_core.annotation import DepthKind
 from vipe_core.cameras import Camera, CameraModel
 from vipe_core.errors import ConfigError, FormatError, VipeError
+from vipe_core.formats.artifacts import DISK_DEPTH_KINDS
 from vipe_core.formats.depth_zip import DepthZipReader
 from vipe_core.formats.layout import artifact_path, info_path
 from vipe_core.video.probe import probe
@@ -109,7 +110,7 @@ def read_artifacts(root: str | Path, name: str) -> Artifacts:
         frame_index=inds,
         camera=camera,
         intrinsics=intrinsics,
-        depth_kind="ray" if model == "equirect" else "z",
+        depth_kind=DISK_DEPTH_KINDS[model],
         timestamps_s=None if stamps is None else np.asarray(stamps, dtype=np.float64),
         info=info,
     )
