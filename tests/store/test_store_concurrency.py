@@ -1,0 +1,162 @@
+"""Many at once: threads here, processes of their own, and what a reader sees meanwhile."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import threading
+from collections import Counter
+from collections.abc import Callable
+from pathlib import Path
+
+from store_helpers import planned_job, plans, record, spec
+
+from services.domain.models import Lease
+from services.domain.states import JobState
+from services.store.sql import SqlStore
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def at_once(*work: Callable[[], None]) -> None:
+    """Run each in a thread of its own, started together; the first error is raised."""
+    barrier = threading.Barrier(len(work))
+    errors: list[BaseException] = []
+
+    def run(each: Callable[[], None]) -> None:
+        try:
+            barrier.wait()
+            each()
+        except BaseException as error:
+            errors.append(error)
+
+    threads = [threading.Thread(target=run, args=(each,)) for each in work]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    if errors:
+        raise errors[0]
+
+
+def test_every_shard_is_leased_once(store: SqlStore) -> None:
+    planned_job(store, 60, videos_each=1)
+    claimed: list[Lease] = []
+
+    def agent(holder: str) -> Callable[[], None]:
+        def work() -> None:
+            while leases := store.claim(holder, limit=3, ttl_s=600):
+                claimed.extend(leases)
+
+        return work
+
+    at_once(*(agent(f"a{i}") for i in range(6)))
+    assert Counter(lease.ordinal for lease in claimed) == Counter(range(60))
+    assert {lease.fence for lease in claimed} == {1}
+
+
+_CLAIMER = """
+import sys
+from services.store.sql import SqlStore
+store = SqlStore(sys.argv[1], migrate=False)
+while leases := store.claim(sys.argv[2], limit=2, ttl_s=600):
+    for lease in leases:
+        print(lease.ordinal, lease.fence, flush=True)
+"""
+
+
+def test_processes_lease_every_shard_once(store: SqlStore, store_url: str) -> None:
+    planned_job(store, 40, videos_each=1)
+    env = {**os.environ, "PYTHONPATH": str(ROOT)}
+    command = [sys.executable, "-c", _CLAIMER, store_url]
+    processes = [
+        subprocess.Popen([*command, f"p{i}"], env=env, cwd=ROOT, stdout=subprocess.PIPE, text=True) for i in range(3)
+    ]
+    lines = [line for p in processes for line in p.communicate(timeout=120)[0].splitlines()]
+    assert [p.returncode for p in processes] == [0, 0, 0]
+    assert sorted(int(line.split()[0]) for line in lines) == list(range(40))
+    assert {line.split()[1] for line in lines} == {"1"}
+
+
+def test_a_whole_job_by_many_agents(store: SqlStore) -> None:
+    """Claims, commits, give-backs, expiries and readers all at once; the counters come out exact."""
+    job_id = planned_job(store, 24, videos_each=2)
+    done = threading.Event()
+    seen: list[int] = []
+
+    def agent(holder: str, careless: bool) -> Callable[[], None]:
+        def work() -> None:
+            while not done.is_set():
+                for lease in store.claim(holder, limit=2, ttl_s=600):
+                    if careless and lease.attempt == 1:
+                        store.release(lease.shard_id, lease.fence, "not today")
+                    else:
+                        store.record_commit(record(lease))
+                        store.record_commit(record(lease))
+
+        return work
+
+    def keeper() -> None:
+        while not done.is_set():
+            store.expire_leases()
+            job = store.next_finalizable()
+            if job is not None:
+                store.finish_job(job.id)
+                done.set()
+
+    def reader() -> None:
+        """Reads by number as a stream does: nothing may turn up behind what was read."""
+        while not done.is_set() or seen[-1:] != [e.seq for e in store.events(job_id)][-1:]:
+            seen.extend(e.seq for e in store.events(job_id, after_seq=seen[-1] if seen else 0))
+
+    at_once(agent("a", False), agent("b", True), agent("c", True), keeper, reader)
+    job = store.get_job(job_id)
+    assert job.state is JobState.SUCCEEDED
+    assert (job.progress.shards_committed, job.progress.videos_succeeded, job.progress.frames_done) == (24, 48, 480)
+    assert seen == [e.seq for e in store.events(job_id)]
+    committed = [e.data["shard_id"] for e in store.events(job_id) if e.kind == "shard.committed"]
+    assert len(committed) == len(set(committed)) == 24
+
+
+def test_one_owner_per_output_and_one_job_per_key(store: SqlStore) -> None:
+    results: list[str] = []
+
+    def submit() -> None:
+        results.append(store.create_job(spec(), idempotency_key="k")[0].id)
+
+    at_once(*[submit] * 6)
+    assert len(set(results)) == 1
+    assert len(store.list_jobs()[0]) == 1
+
+
+def test_two_planners_write_one_plan(store: SqlStore) -> None:
+    job, _ = store.create_job(spec())
+    store.begin_planning(job.id)
+
+    def planner() -> None:
+        for i in range(0, 12, 3):
+            store.add_shards(job.id, plans(12)[i : i + 3])
+        store.finish_planning(job.id)
+
+    at_once(planner, planner)
+    progress = store.get_job(job.id).progress
+    assert (progress.shards_total, progress.videos_total) == (12, 24)
+    assert [s.ordinal for s in store.list_shards(job.id)[0]] == list(range(12))
+
+
+def test_cancelling_while_agents_claim(store: SqlStore) -> None:
+    """However it interleaves: no lease is given out behind the cancellation, and the job ends."""
+    for round_number in range(6):
+        job_id = planned_job(store, 8, videos_each=1, output=f"/out{round_number}")
+        claimed: list[Lease] = []
+        at_once(
+            lambda mine=claimed: mine.extend(store.claim("a", limit=4, ttl_s=600)),  # type: ignore[misc]
+            lambda mine=claimed: mine.extend(store.claim("b", limit=4, ttl_s=600)),  # type: ignore[misc]
+            lambda job_id=job_id: store.request_cancel(job_id),  # type: ignore[misc]
+        )
+        assert store.claim("c", limit=9, ttl_s=600) == []
+        for lease in claimed:
+            store.release(lease.shard_id, lease.fence, "cancelled")
+        assert store.get_job(job_id).state is JobState.CANCELLED
+        assert {s.state.value for s in store.list_shards(job_id)[0]} == {"cancelled"}

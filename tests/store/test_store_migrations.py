@@ -1,0 +1,94 @@
+"""The migrations give the schema that the code uses, on an empty database, once, also when many start at once."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from alembic.autogenerate import compare_metadata
+from alembic.migration import MigrationContext
+from sqlalchemy import inspect, text
+from store_helpers import planned_job
+
+from services.domain.errors import StoreUnavailable
+from services.store import migrations
+from services.store.database import Database
+from services.store.schema import metadata
+from services.store.sql import SqlStore
+
+
+def test_the_migrated_schema_is_the_codes(store_url: str) -> None:
+    database = Database(store_url)
+    assert migrations.current(database) is None
+    migrations.upgrade(database)
+    assert migrations.current(database) == migrations.head()
+    with database.engine.connect() as conn:
+        context = MigrationContext.configure(conn, opts={"compare_type": True})
+        assert compare_metadata(context, metadata) == []
+        checks = {c["name"] for table in metadata.tables for c in inspect(conn).get_check_constraints(table)}
+    assert checks == {"ck_jobs_state", "ck_shards_state", "ck_videos_status"}
+    database.close()
+
+
+def test_upgrading_keeps_what_is_there(store_url: str) -> None:
+    store = SqlStore(store_url)
+    job_id = planned_job(store)
+    store.upgrade()
+    assert store.get_job(job_id).progress.shards_total == 3
+    store.close()
+
+
+def test_many_processes_start_at_once(store_url: str) -> None:
+    errors: list[Exception] = []
+
+    def start() -> None:
+        try:
+            SqlStore(store_url).close()
+        except Exception as error:
+            errors.append(error)
+
+    threads = [threading.Thread(target=start) for _ in range(6)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert errors == []
+
+
+def test_the_states_are_checked_by_the_database_too(store: SqlStore, store_url: str) -> None:
+    job_id = planned_job(store)
+    database = Database(store_url)
+    with pytest.raises(Exception, match="ck_jobs_state"), database.engine.begin() as conn:
+        conn.execute(text("UPDATE jobs SET state = 'bored' WHERE id = :id"), {"id": job_id})
+    database.close()
+
+
+def test_sqlite_is_opened_for_many_processes(tmp_path: Path) -> None:
+    database = Database(f"sqlite:///{tmp_path}/new/folder/store.db")
+    with database.engine.connect() as conn:
+        pragmas = {name: conn.execute(text(f"PRAGMA {name}")).scalar_one() for name in ("journal_mode", "foreign_keys")}
+        assert pragmas == {"journal_mode": "wal", "foreign_keys": 1}
+        assert conn.execute(text("PRAGMA busy_timeout")).scalar_one() >= 10_000
+    database.close()
+
+
+@pytest.mark.parametrize("url", ["sqlite://", "sqlite:///:memory:", "mysql://host/db"])
+def test_addresses_that_are_not_supported(url: str) -> None:
+    with pytest.raises(ValueError, match="sqlite"):
+        Database(url)
+
+
+@pytest.mark.parametrize("url", ["sqlite:///{tmp}", "postgresql://127.0.0.1:9/nothing"])
+def test_a_database_that_does_not_answer(tmp_path: Path, url: str) -> None:
+    with pytest.raises(StoreUnavailable, match="does not answer"):
+        SqlStore(url.format(tmp=tmp_path))
+
+
+def test_two_stores_share_nothing(new_store_url: Callable[[], str]) -> None:
+    first, second = SqlStore(new_store_url()), SqlStore(new_store_url())
+    planned_job(first)
+    assert second.list_jobs() == ([], None)
+    first.close()
+    second.close()
