@@ -1,18 +1,24 @@
-"""From uploaded tars to a shard that exists, and back from a record in the output to a database that missed it."""
+"""From uploaded tars to a shard that exists, and back from a record in the output to a database that missed it.
+
+`services.commit` brings the tar writer and its heavy libraries along, so it is imported when it is first needed: an API
+that carries an agent must not start slowly for it.
+"""
 
 from __future__ import annotations
 
 import logging
 import threading
+from typing import TYPE_CHECKING
 
 from services.agent.traffic import TrafficMetrics
-from services.commit.protocol import CommitOutcome, PreparedPayload, write_record
-from services.commit.reconcile import committed_record, committed_records
 from services.domain.errors import CommitConflict
 from services.domain.models import CommitRecord, Job, Lease
 from services.observability.metrics import Metrics
 from services.storage import ObjectStore, open_store
 from services.store.base import Store
+
+if TYPE_CHECKING:
+    from services.commit.protocol import CommitOutcome, PreparedPayload
 
 logger = logging.getLogger(__name__)
 
@@ -43,6 +49,8 @@ class Committer:
 
     def write(self, lease: Lease, payload: PreparedPayload) -> CommitOutcome:
         """The commit point. Idempotent; see `services.commit.protocol.write_record` for what it raises."""
+        from services.commit.protocol import write_record
+
         output = self.output(lease.spec.output)
         try:
             outcome = write_record(output, payload, lambda: self._store.holds(lease.shard_id, lease.fence))
@@ -69,6 +77,8 @@ class Committer:
         Raises:
             CommitConflict: The record belongs to another plan.
         """
+        from services.commit.reconcile import committed_record
+
         found = committed_record(self.output(lease.spec.output), lease.job_id, lease.shard_id)
         if found is None:
             return False
@@ -77,6 +87,8 @@ class Committer:
 
     def reconcile(self, job: Job) -> int:
         """Compare a job's open shards with the records in its output; returns how many the database had missed."""
+        from services.commit.reconcile import committed_records
+
         open_shards = {shard.id for shard in self._store.uncommitted_shards(job.id)}
         if not open_shards:
             return 0

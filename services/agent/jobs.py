@@ -9,7 +9,6 @@ from collections.abc import Callable
 from services.agent.backoff import Backoff
 from services.agent.commits import Committer
 from services.agent.config import AgentConfig
-from services.dataset import finalise
 from services.domain.errors import ServiceError
 from services.domain.models import Job
 from services.domain.states import JobState
@@ -98,10 +97,21 @@ class JobKeeper:
         return True
 
     def _finalise_job(self, job: Job) -> None:
+        from services.dataset.finalise import finalise  # Slow to import; see `services.agent.commits`.
+
         backoff = self._finalising.setdefault(job.id, self._backoff())
         started = self._clock()
         try:
-            finalise(job, self._committer.output(job.spec.output))
+            scratch = self._config.scratch_dir / "finalise"
+            scratch.mkdir(parents=True, exist_ok=True)
+            finalise(
+                self._committer.output(job.spec.output),
+                job.id,
+                job.spec,
+                num_shards=job.progress.shards_total,
+                num_videos=job.progress.videos_total,
+                scratch=scratch,
+            )
             done = self._store.finish_job(job.id)
         except Exception as error:
             typed = isinstance(error, ServiceError)

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
-from services.commit.protocol import PreparedPayload
 from services.domain.models import Lease, VideoRef, VideoResult
+
+if TYPE_CHECKING:
+    from services.commit.protocol import PreparedPayload
 
 FailureScope = Literal["video", "storage", "shard", "job"]
 """Whom a failure concerns: this video; storage, so everybody for a while; this shard; or every video of the job."""

@@ -11,6 +11,7 @@ must be called from a thread that lives as long as the executor.
 from __future__ import annotations
 
 import contextlib
+import faulthandler
 import logging
 import math
 import os
@@ -20,6 +21,7 @@ import signal
 import tempfile
 import threading
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -40,8 +42,10 @@ _NAMESPACE = "vipe"
 _THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
 
 # Read by Ray when it starts. A private Ray reports to nobody, and its helpers outlive its head by seconds only.
+# Its own signal handler would end this process three seconds after a SIGTERM, in the middle of an orderly stop.
 _PRIVATE_ENVIRONMENT = {
     "RAY_USAGE_STATS_ENABLED": "0",
+    "RAY_DISABLE_FAILURE_SIGNAL_HANDLER": "1",
     "RAY_gcs_rpc_server_reconnect_timeout_s": "10",
     "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0",
 }
@@ -51,6 +55,7 @@ class SlotActor:
     """The actor: a `Slot`, with `progress` and `cancel` answered beside the running task."""
 
     def __init__(self, config: SlotConfig, log_level: str) -> None:
+        faulthandler.enable()  # The stack of a crash goes to the worker's log in Ray's session folder.
         configure_logging(log_level, "text")
         self._slot = Slot(config)
 
@@ -227,7 +232,7 @@ class RayExecutor:
 
     def _start_private(self) -> None:
         config = self._config
-        os.environ.update(_PRIVATE_ENVIRONMENT)
+        os.environ.update(_PRIVATE_ENVIRONMENT)  # Before Ray is imported: it reads some of these only then.
         if "RAY_AUTH_MODE" not in os.environ:
             # Whoever reaches Ray's ports runs code as this user: a token that only this process and its children know.
             os.environ["RAY_AUTH_MODE"] = "token"
@@ -237,23 +242,28 @@ class RayExecutor:
         self._temp_dir = private_temp_dir(config.scratch_dir.parent)
         gpus = math.ceil(config.slots * config.gpus_per_slot) if config.device == "cuda" else 0
         logging.getLogger("ray").setLevel(logging.ERROR)  # It warns about every thread that is not the main one.
-        ray.init(
-            address="local",
-            num_cpus=config.slots * config.cpus_per_slot,
-            num_gpus=gpus,
-            object_store_memory=_OBJECT_STORE_BYTES,
-            include_dashboard=False,
-            log_to_driver=False,
-            configure_logging=False,
-            namespace=_NAMESPACE,
-            _temp_dir=str(self._temp_dir),
-        )
+        with _environment(self._worker_environment()):  # Workers inherit it, which is faster than a runtime_env.
+            ray.init(
+                address="local",
+                num_cpus=config.slots * config.cpus_per_slot,
+                num_gpus=gpus,
+                object_store_memory=_OBJECT_STORE_BYTES,
+                include_dashboard=False,
+                log_to_driver=False,
+                configure_logging=False,
+                namespace=_NAMESPACE,
+                _temp_dir=str(self._temp_dir),
+            )
+
+    def _worker_environment(self) -> dict[str, str]:
+        """Numeric libraries use the cores that the slot reserved, and do not spin while they wait."""
+        threads = str(self._config.cpus_per_slot)
+        return {**dict.fromkeys(_THREAD_VARIABLES, threads), "OMP_WAIT_POLICY": "passive"}
 
     def _actor_class(self) -> Any:
         import ray
 
         config = self._config
-        threads = str(config.cpus_per_slot)
         for beside_the_task in (SlotActor.progress, SlotActor.cancel):
             ray.method(concurrency_group="control")(beside_the_task)  # Marks the function.
         return ray.remote(
@@ -262,8 +272,23 @@ class RayExecutor:
             max_restarts=0,
             max_task_retries=0,
             concurrency_groups={"control": 2},
-            runtime_env={"env_vars": {**dict.fromkeys(_THREAD_VARIABLES, threads), "OMP_WAIT_POLICY": "passive"}},
+            runtime_env=None if self._private else {"env_vars": self._worker_environment()},
         )(SlotActor)
+
+
+@contextlib.contextmanager
+def _environment(values: dict[str, str]) -> Iterator[None]:
+    """Set environment variables for the processes that are started inside."""
+    before = {name: os.environ.get(name) for name in values}
+    os.environ.update(values)
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value
 
 
 def private_temp_dir(preferred: Path) -> Path:

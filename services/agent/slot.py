@@ -33,7 +33,6 @@ from services.agent.messages import (
 )
 from services.agent.scratch import ShardScratch, sweep
 from services.agent.traffic import TrafficRecorder
-from services.commit.protocol import prepare_payload
 from services.domain.errors import InputUnavailable, ObjectMissing, ServiceError, StorageError
 from services.domain.models import VideoRef, VideoResult
 from services.domain.states import VideoStatus
@@ -160,6 +159,8 @@ class Slot:
         return failure
 
     def _pack(self, task: PackShard) -> Answer:
+        from services.commit.protocol import prepare_payload  # Slow to import: not before the process is ready.
+
         self._progress = SlotProgress(None, "pack")
         scratch = ShardScratch(self._config.scratch_dir, task.lease)
         output = open_store(task.lease.spec.output, endpoint_url=self._config.s3_endpoint_url, observer=self._traffic)

@@ -67,7 +67,8 @@ class _Formatter(logging.Formatter):
     """What both formats share: context, extras and redaction."""
 
     def fields(self, record: logging.LogRecord) -> dict[str, object]:
-        extras = {name: value for name, value in vars(record).items() if name not in _STANDARD}
+        # Ray's record factory adds fields of its own, with a leading underscore.
+        extras = {k: v for k, v in vars(record).items() if k not in _STANDARD and not k.startswith("_")}
         return {**dict(_context.get()), **extras}
 
 

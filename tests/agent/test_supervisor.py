@@ -79,7 +79,7 @@ def test_deaths_of_an_earlier_lease_are_remembered(rig: Rig) -> None:
 
 
 def test_a_slot_on_which_everything_dies_is_fenced_and_blames_nobody_for_good(rig: Rig) -> None:
-    job_id = rig.job({name: "die" for name in "abcd"})
+    job_id = rig.job(dict.fromkeys("abcd", "die"))
     live = rig.lease()
     outcome = rig.supervisor.work(live)
     assert (outcome.kind, outcome.fenced) == ("given_back", True)
@@ -89,7 +89,7 @@ def test_a_slot_on_which_everything_dies_is_fenced_and_blames_nobody_for_good(ri
 
 
 def test_a_fenced_slot_that_is_pardoned_ends_the_job_after_all(rig: Rig) -> None:
-    rig.job({name: "die" for name in "abcd"})
+    rig.job(dict.fromkeys("abcd", "die"))
     for _ in range(20):
         live = rig.lease()
         outcome = rig.supervisor.work(live)

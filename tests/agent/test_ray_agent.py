@@ -1,0 +1,234 @@
+"""The agent on a real private Ray: real worker processes that really die."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+from agent_rig import Rig
+
+from services.agent.agent import Agent
+from services.agent.config import AgentConfig
+from services.agent.executor import Died
+from services.agent.messages import Annotated, AnnotateVideo, Cancelled, Opened, OpenShard, Reply
+from services.agent.ray_executor import RayExecutor, RaySlot
+from services.commit.reconcile import committed_records
+from services.domain.models import Job, JobSpec, VideoResult
+from services.domain.states import JobState, VideoStatus
+from services.observability.metrics import Metrics
+from services.storage import open_store
+from services.store.sql import SqlStore
+
+pytestmark = pytest.mark.slow
+
+HERE = Path(__file__).parent
+
+
+@pytest.fixture(autouse=True)
+def _engines_importable_in_workers(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("PYTHONPATH", f"{HERE}{os.pathsep}{Path.cwd()}")
+
+
+def _config(root: Path) -> AgentConfig:
+    return AgentConfig(scratch_dir=root / "scratch", engine="agent_engines:open_in_process", poll_s=0.2)
+
+
+def _wait(condition: Callable[[], bool], what: str, seconds: float = 90.0) -> None:
+    deadline = time.monotonic() + seconds
+    while not condition():
+        if time.monotonic() > deadline:
+            pytest.fail(f"waited in vain for: {what}")
+        time.sleep(0.1)
+
+
+def _submit(store: SqlStore, root: Path, scripts: dict[str, str], *, shard_max_videos: int = 16) -> str:
+    inputs = root / "inputs"
+    inputs.mkdir()
+    for name, script in scripts.items():
+        (inputs / f"{name}.mp4").write_text(script)
+    spec = JobSpec(
+        (str(inputs),),
+        str(root / "out"),
+        attributes=("pose", "intrinsics", "depth"),
+        shard_max_videos=shard_max_videos,
+    )
+    return store.create_job(spec)[0].id
+
+
+def _finished(store: SqlStore, job_id: str) -> Job:
+    _wait(lambda: store.get_job(job_id).state.terminal, f"{job_id} to end")
+    return store.get_job(job_id)
+
+
+def _rows(root: Path, job_id: str) -> dict[str, VideoResult]:
+    """Every committed row by input name; a video that is there twice fails the test."""
+    rows = [row for record in committed_records(open_store(str(root / "out")), job_id) for row in record.videos]
+    assert max(Counter(row.key for row in rows).values()) == 1
+    return {Path(row.uri).stem: row for row in rows}
+
+
+def _ray_processes(root: Path) -> list[str]:
+    """Command lines of live processes that belong to the Ray of the agent in `root`."""
+    found = []
+    for folder in Path("/proc").iterdir():
+        if folder.name.isdigit():
+            try:
+                environment = (folder / "environ").read_bytes()
+                command = (folder / "cmdline").read_bytes().replace(b"\0", b" ").decode()
+            except OSError:
+                continue
+            if f"VIPE_TEST_ROOT={root}".encode() in environment and command:
+                found.append(command[:80])
+    return found
+
+
+@pytest.fixture
+def slot(tmp_path: Path) -> Iterator[RaySlot]:
+    executor = RayExecutor(_config(tmp_path))
+    executor.start()
+    try:
+        (handle,) = executor.slots()
+        assert isinstance(handle, RaySlot)
+        assert handle.start(60) is None
+        yield handle
+    finally:
+        executor.stop()
+
+
+def _result(slot: RaySlot) -> Reply | Died:
+    outcome = slot.poll(60)
+    assert outcome is not None
+    return outcome
+
+
+def test_a_worker_works_reports_stops_and_dies_as_told(slot: RaySlot, tmp_path: Path) -> None:
+    rig = Rig.make(tmp_path)
+    rig.job({"good": "frames=3", "slow": "slow=60", "die": "die"})
+    lease = rig.lease().lease
+    good, slow, die = lease.videos
+
+    slot.submit(OpenShard(lease))
+    assert isinstance(_result(slot), Reply)
+    slot.submit(AnnotateVideo(lease, good))
+    reply = _result(slot)
+    assert isinstance(reply, Reply)
+    assert isinstance(reply.answer, Annotated)
+    assert reply.answer.result.num_frames == 3
+
+    slot.submit(AnnotateVideo(lease, slow))
+    _wait(lambda: slot.progress().stage == "track", "progress beside the running task")
+    assert slot.progress().video_key == slow.key
+    slot.cancel()
+    reply = _result(slot)
+    assert isinstance(reply, Reply)
+    assert isinstance(reply.answer, Cancelled)
+
+    first = slot.pid
+    slot.submit(AnnotateVideo(lease, die))
+    died = _result(slot)
+    assert isinstance(died, Died)
+    assert not died.preempted
+    slot.kill()
+
+    assert slot.start(60) is None
+    assert slot.pid not in (None, first)
+    slot.submit(OpenShard(lease))
+    reply = _result(slot)
+    assert isinstance(reply, Reply)
+    assert isinstance(reply.answer, Opened)
+    assert [result.key for result in reply.answer.results] == [good.key]
+
+    slot.submit(AnnotateVideo(lease, slow))
+    pid = slot.pid
+    assert pid is not None
+    slot.kill()
+    _wait(lambda: not Path(f"/proc/{pid}").exists(), "the killed worker to be gone", 10)
+
+
+def test_deaths_and_poison_leave_the_others_unharmed(tmp_path: Path) -> None:
+    store, metrics, config = SqlStore(f"sqlite:///{tmp_path}/vipe.db"), Metrics(), _config(tmp_path)
+    executor = RayExecutor(config)
+    agent = Agent(store, config, executor, metrics)
+    count = tmp_path / "count"
+    job_id = _submit(
+        store,
+        tmp_path,
+        {
+            "a": f"frames=3 count={count}",
+            "b-shot": f"slow=2 count={count}",
+            "c-poison": f"die count={count}",
+            "d": f"frames=4 count={count}",
+            "e-corrupt": "error",
+        },
+    )
+    agent.start()
+    try:
+        # kill -9 of the worker while it works on the second video.
+        _wait(lambda: count.exists() and "b-shot" in count.read_text(), "the second video to begin")
+        (handle,) = executor.slots()
+        assert isinstance(handle, RaySlot)
+        assert handle.pid is not None
+        os.kill(handle.pid, signal.SIGKILL)
+        job = _finished(store, job_id)
+    finally:
+        agent.stop()
+        store.close()
+    rows = _rows(tmp_path, job_id)
+    assert job.state is JobState.SUCCEEDED_WITH_ERRORS
+    assert {name: row.status for name, row in rows.items()} == {
+        "a": VideoStatus.SUCCEEDED,
+        "b-shot": VideoStatus.SUCCEEDED,
+        "c-poison": VideoStatus.QUARANTINED,
+        "d": VideoStatus.SUCCEEDED,
+        "e-corrupt": VideoStatus.FAILED,
+    }
+    tried = Counter(line.rsplit("-", 1)[0] for line in count.read_text().split())
+    assert tried == {"a": 1, "b-shot": 2, "c-poison": 3, "d": 1}
+    assert metrics.registry.get_sample_value("vipe_actor_restarts_total", {"reason": "died"}) == 4
+    assert metrics.registry.get_sample_value("vipe_videos_total", {"outcome": "succeeded", "error_class": ""}) == 3
+    assert (tmp_path / "out" / "dataset.json").exists()
+
+
+def test_kill_9_of_the_agent_loses_and_doubles_nothing(tmp_path: Path) -> None:
+    store = SqlStore(f"sqlite:///{tmp_path}/vipe.db")
+    count = tmp_path / "count"
+    scripts = {f"v{number}": f"frames=3 slow=0.5 count={count}" for number in range(8)}
+    job_id = _submit(store, tmp_path, scripts, shard_max_videos=4)
+    environment = {**os.environ, "VIPE_TEST_ROOT": str(tmp_path)}
+
+    def run() -> subprocess.Popen[bytes]:
+        log = (tmp_path / "agent.log").open("ab")
+        return subprocess.Popen(
+            [sys.executable, str(HERE / "agent_process.py"), str(tmp_path)], stdout=log, stderr=log, env=environment
+        )
+
+    first = run()
+    # One shard committed, the other in its middle.
+    _wait(lambda: count.exists() and len(count.read_text().split()) >= 6, "the second shard to be under way")
+    first.send_signal(signal.SIGKILL)
+    first.wait()
+    assert store.get_job(job_id).progress.shards_committed == 1
+    _wait(lambda: not any("ray::" in c and "Slot" in c for c in _ray_processes(tmp_path)), "the worker to die", 20)
+
+    second = run()
+    try:
+        job = _finished(store, job_id)
+    finally:
+        second.send_signal(signal.SIGTERM)
+        second.wait(60)
+    assert second.returncode == 0
+    assert job.state is JobState.SUCCEEDED
+    assert {row.status for row in _rows(tmp_path, job_id).values()} == {VideoStatus.SUCCEEDED}
+    tried = Counter(line.rsplit("-", 1)[0] for line in count.read_text().split())
+    # What was committed or finished is not done again; at most the video that was running at the kill is.
+    assert set(tried) == set(scripts)
+    assert all(tried[f"v{number}"] == 1 for number in range(4))
+    assert sum(tried.values()) <= len(scripts) + 1
+    store.close()
