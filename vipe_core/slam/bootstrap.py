@@ -32,7 +32,7 @@ POSE_ONLY = (Step("huber", 1.0, 8), Step("geman_mcclure", 2.0, 8), Step("geman_m
 _MAX_SEEDS = 3
 _MIN_POINTS = 50
 _MIN_WEIGHT = 0.3
-_MAX_POINTS = 2000
+_MAX_POINTS = 600
 _DEPTH_SPREAD = 20.0
 # Two starts that end this close have found the same minimum: no need to try more.
 _SAME_COST = 0.01
@@ -113,7 +113,7 @@ class Bootstrap:
             "height": int(self._keyframes.grid.height * self._keyframes.grid.stride),
             "params": [fx, fy, cx, cy],
         }
-        ransac = {"max_iterations": 1000, "max_epipolar_error": 1.0, "max_reproj_error": 1.0, "seed": 0}
+        ransac = {"max_iterations": 300, "max_epipolar_error": 1.0, "max_reproj_error": 1.0, "seed": 0}
         pose, report = poselib.estimate_relative_pose(source, target, camera, camera, ransac, {})
         _, flat = poselib.estimate_homography(source, target, ransac, {})
         relative = np.eye(4)
