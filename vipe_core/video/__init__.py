@@ -6,7 +6,7 @@ Kept free of heavy imports (torch, OpenCV, PyAV): the decoder child imports this
 from vipe_core.video.cache import FrameCache
 from vipe_core.video.image_directory import ImageDirectorySource
 from vipe_core.video.limits import Limits
-from vipe_core.video.naming import sanitise_name, unique_names
+from vipe_core.video.naming import sanitise_name
 from vipe_core.video.opening import open_source
 from vipe_core.video.probe import probe
 from vipe_core.video.source import Frame, FrameSource, FrameStream, VideoInfo
@@ -24,5 +24,4 @@ __all__ = [
     "open_source",
     "probe",
     "sanitise_name",
-    "unique_names",
 ]
