@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import uuid
 from collections.abc import Callable
 from pathlib import Path
@@ -20,11 +21,17 @@ SHARDS = [["cat-1", "bad-1", "ant-2"], ["bad-2", "poison-3"], ["dog-3"]]
 SPEC = JobSpec(inputs=("/in",), output="/out", name='Three "animals"')
 
 
-def commit_all(store: ObjectStore, tmp_path: Path) -> None:
-    """Three shards: one mixed, one without any success, one with a single video."""
-    artifacts = tmp_path / "artifacts"
+@pytest.fixture(scope="session")
+def engine_output(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    root = tmp_path_factory.mktemp("engine")
     for key, count in FRAMES.items():
-        write_artifacts(artifacts, key, count, info=True)
+        write_artifacts(root, key, count, info=True)
+    return root
+
+
+def commit_all(store: ObjectStore, engine_output: Path, tmp_path: Path) -> None:
+    """Three shards: one mixed, one without any success, one with a single video."""
+    artifacts = shutil.copytree(engine_output, tmp_path / "artifacts")
     for ordinal, keys in enumerate(SHARDS):
         results = [
             success(k, FRAMES[k]) if k in FRAMES else failure(k, quarantined=k.startswith("poison")) for k in keys
@@ -33,9 +40,9 @@ def commit_all(store: ObjectStore, tmp_path: Path) -> None:
 
 
 @pytest.fixture
-def committed(tmp_path: Path) -> DirectoryStore:
+def committed(engine_output: Path, tmp_path: Path) -> DirectoryStore:
     store = DirectoryStore(tmp_path / "out")
-    commit_all(store, tmp_path)
+    commit_all(store, engine_output, tmp_path)
     return store
 
 
@@ -46,7 +53,9 @@ def finished(committed: DirectoryStore) -> DirectoryStore:
 
 
 @pytest.fixture(params=["directory", "s3"])
-def any_finished(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> ObjectStore:
+def any_finished(
+    request: pytest.FixtureRequest, engine_output: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> ObjectStore:
     store: ObjectStore
     if request.param == "directory":
         store = DirectoryStore(tmp_path / "out")
@@ -61,7 +70,7 @@ def any_finished(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: py
         bucket = f"d-{uuid.uuid4().hex[:12]}"
         boto3.client("s3", endpoint_url=endpoint).create_bucket(Bucket=bucket)
         store = S3Store(bucket, "data/set", endpoint_url=endpoint)
-    commit_all(store, tmp_path)
+    commit_all(store, engine_output, tmp_path)
     finalise(store, JOB, SPEC, num_shards=3, num_videos=6)
     return store
 
