@@ -16,6 +16,7 @@ from vipe_core.priors.protocols import DenseMatcher, Match
 from vipe_core.slam.adjustment import Adjuster, Step
 from vipe_core.slam.keyframes import KeyframeMap
 from vipe_core.slam.reprojection import Reprojector, relative_pose
+from vipe_core.slam.rotation import Link, RotationFitter
 from vipe_core.slam.selection import Report
 from vipe_core.slam.working import WorkingSize, working_frame
 from vipe_core.video.source import FrameSource
@@ -51,16 +52,28 @@ class _Pending:
 
 
 class Infill:
-    """Poses every frame of the video against the finished map."""
+    """Poses every frame of the video against the finished map.
+
+    Args:
+        batch: Frames that are posed together.
+        rotation_only: Fits rotations instead of poses, for a camera that only turns.
+    """
 
     def __init__(
-        self, keyframes: KeyframeMap, matcher: DenseMatcher, adjuster: Adjuster, reprojector: Reprojector, batch: int
+        self,
+        keyframes: KeyframeMap,
+        matcher: DenseMatcher,
+        adjuster: Adjuster,
+        reprojector: Reprojector,
+        batch: int,
+        rotation_only: RotationFitter | None = None,
     ) -> None:
         self._keyframes = keyframes
         self._matcher = matcher
         self._adjuster = adjuster
         self._reprojector = reprojector
         self._batch = batch
+        self._rotation_only = rotation_only
 
     def run(self, source: FrameSource, size: WorkingSize, times_s: Array, report: Report) -> Trajectory:
         """Decode the video once more and pose its frames; holds one batch of measurements at a time.
@@ -105,7 +118,34 @@ class Infill:
         return _Pending(index, np.array(start), tuple(matches))
 
     def _solve(self, pending: list[_Pending], poses: Array, inlier_ratio: Array) -> None:
-        """Motion-only adjustment of a batch: keyframes are fixed sources, frames are free targets."""
+        """Fit the poses of a batch; a frame that its measurements do not support keeps its interpolated pose."""
+        solved = self._adjusted(pending) if self._rotation_only is None else self._turned(pending, self._rotation_only)
+        if solved is None:
+            return
+        for frame, pose in zip(pending, solved, strict=True):
+            ratio = self._inliers(frame, pose)
+            if ratio >= _MIN_INLIERS and np.isfinite(pose).all():
+                poses[frame.index] = pose
+                inlier_ratio[frame.index] = ratio
+
+    def _turned(self, pending: list[_Pending], fitter: RotationFitter) -> NDArray[np.float64]:
+        """(B, 4, 4) rotation-only poses of a batch."""
+        sources = sorted({k for frame in pending for k, _ in frame.matches})
+        number = {k: row for row, k in enumerate(sources)}
+        first = len(sources)
+        links = [
+            Link(number[k], first + row, match, self._keyframes.static(k))
+            for row, frame in enumerate(pending)
+            for k, match in frame.matches
+        ]
+        start = np.stack([self._keyframes.pose(k) for k in sources] + [frame.start for frame in pending])
+        fit = fitter.fit(start[:, :3, :3], range(first), links, self._keyframes.intrinsics)
+        poses = np.tile(np.eye(4), (len(pending), 1, 1))
+        poses[:, :3, :3] = fit.rotations[first:]
+        return poses
+
+    def _adjusted(self, pending: list[_Pending]) -> NDArray[np.float64] | None:
+        """(B, 4, 4) by a motion-only adjustment: keyframes are fixed sources, frames are free targets."""
         device = self._adjuster.device
         sources = sorted({k for frame in pending for k, _ in frame.matches})
         number = {k: row for row, k in enumerate(sources)}
@@ -137,14 +177,7 @@ class Infill:
             intrinsics=torch.from_numpy(self._keyframes.intrinsics.copy()).to(device),
         )
         result = self._adjuster.anneal(problem, state, _SCHEDULE)
-        if result is None:
-            return
-        solved = result.state.cam_from_world.cpu().numpy()
-        for row, frame in enumerate(pending):
-            ratio = self._inliers(frame, solved[first + row])
-            if ratio >= _MIN_INLIERS and np.isfinite(solved[first + row]).all():
-                poses[frame.index] = solved[first + row]
-                inlier_ratio[frame.index] = ratio
+        return None if result is None else result.state.cam_from_world[first:].cpu().numpy()
 
     def _inliers(self, frame: _Pending, cam_from_world: Array) -> float:
         """Share of the weight of a frame's measurements whose residual is within the robust scale."""

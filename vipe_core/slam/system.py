@@ -27,6 +27,7 @@ from vipe_core.slam.infill import Infill
 from vipe_core.slam.keyframes import KeyframeMap
 from vipe_core.slam.measuring import MeasuredGraph
 from vipe_core.slam.reprojection import Reprojector
+from vipe_core.slam.rotation import Link, RotationFitter
 from vipe_core.slam.selection import Report, Selection, select_keyframes
 from vipe_core.slam.settings import SlamSettings
 from vipe_core.slam.tracking import Tracker
@@ -36,6 +37,12 @@ from vipe_core.video.source import FrameSource
 logger = logging.getLogger(__name__)
 
 Motion = Literal["general", "rotation", "static"]
+
+# Below this parallax it is worth asking whether the camera only turned.
+_MAYBE_ROTATION_DEG = 1.5
+# Rotations alone explain a clip when their residual is within this of the full model's.
+_ROTATION_RATIO = 1.3
+_ROTATION_SLACK_PX = 0.05
 
 
 @dataclass(frozen=True, slots=True)
@@ -125,6 +132,15 @@ class Slam:
             backend.run()
             report("backend", 1, 1)
         found = examine(reprojector, keyframes, graph, adjuster.robust_scale_px)
+        motion: Motion = "static" if static else "general"
+        focal = backend.focal
+        fitter = RotationFitter("pinhole", size.grid, adjuster.robust_scale_px)
+        if not static and found.parallax_deg < _MAYBE_ROTATION_DEG:
+            with _timed(timings, "rotation"):
+                turned = self._rotation_only(fitter, keyframes, graph, adjuster.focal_prior, found)
+            if turned is not None:
+                motion, focal = "rotation", turned
+                found = examine(reprojector, keyframes, graph, adjuster.robust_scale_px)
         with _timed(timings, "infill"):
             if static:
                 cam_from_world = np.tile(np.eye(4), (selection.num_frames, 1, 1))
@@ -144,11 +160,35 @@ class Slam:
             static=keyframes.statics(),
             working=size,
             camera=_camera(keyframes.intrinsics, size),
-            motion="static" if static else "general",
-            focal=backend.focal,
+            motion=motion,
+            focal=focal,
             map=found,
             timings_s=timings,
         )
+
+    def _rotation_only(
+        self, fitter: RotationFitter, keyframes: KeyframeMap, graph: Graph, prior: FocalPrior, found: MapReport
+    ) -> FocalReport | None:
+        """Replace the map by rotations when they explain the measurements as well as poses and depths do."""
+        links = [Link(i, j, graph[i, j], np.ones(keyframes.grid.num_cells, dtype=np.bool_)) for i, j in graph]
+        if not links:
+            return None
+        inflation = self._settings.focal_sigma_inflation
+        start = fitter.chain(len(keyframes), links, keyframes.intrinsics)
+        scaled = FocalPrior(prior.log_focal, prior.sigma / inflation)
+        fit = fitter.fit(start, (0,), links, keyframes.intrinsics, scaled)
+        logger.debug("rotation only: %.3f px, with positions: %.3f px", fit.residual_px, found.residual_px)
+        if not fit.residual_px <= _ROTATION_RATIO * found.residual_px + _ROTATION_SLACK_PX:
+            return None
+        keyframes.intrinsics = fit.intrinsics
+        for k, rotation in enumerate(fit.rotations):
+            pose = np.eye(4)
+            pose[:3, :3] = rotation
+            keyframes.set_pose(k, pose)
+            keyframes.set_depth(k, np.ones(keyframes.grid.num_cells))
+            keyframes.set_static(k, np.ones(keyframes.grid.num_cells, dtype=np.bool_))
+        sigma = inflation * fit.log_focal_sigma
+        return FocalReport(sigma, observed=sigma < prior.sigma)
 
     def _initial_camera(self, source: FrameSource, selection: Selection, size: WorkingSize) -> IntrinsicsEstimate:
         """The initial camera at the working size, with pixels that are square in the source video."""
