@@ -82,7 +82,7 @@ class KeyframePrior:
         height, width = scene.inverse_depth.shape[1:]
         self._camera = scene.camera.resized(width, height)
         self._rays = self._camera.rays()
-        values = scene.inverse_depth[(scene.confidence > _CONFIDENT) & (scene.inverse_depth > 0)]
+        values: Array = scene.inverse_depth[(scene.confidence > _CONFIDENT) & (scene.inverse_depth > 0)]
         if not len(values):
             values = scene.inverse_depth[np.isfinite(scene.inverse_depth) & (scene.inverse_depth > 0)]
         if not len(values):
@@ -136,7 +136,7 @@ class KeyframePrior:
         confident = value[trust > _CONFIDENT]
         low, high = _padded_range(confident) if len(confident) >= _MIN_SAMPLES else self._range
         weight = trust.astype(np.float32)
-        filled = np.full(value.shape, self.median, np.float32)
+        filled: Array = np.full(value.shape, self.median, np.float32)
         for sigma in (12.0, 3.0, 1.0):
             total = cv2.GaussianBlur(weight, (0, 0), sigma)
             blurred = cv2.GaussianBlur((weight * value).astype(np.float32), (0, 0), sigma)
@@ -187,7 +187,7 @@ def choose_sources(scene: SceneMap, view: View, prior: Prior, frame: int, settin
     scale = camera.width / 160
     chosen: list[int] = []
     for side in (candidates < frame, candidates > frame):
-        pool = np.flatnonzero(usable & side)
+        pool = np.flatnonzero(usable & side).tolist()
         for wanted in settings.parallax_px:
             left = [i for i in pool if i not in chosen]
             if left:
@@ -195,7 +195,7 @@ def choose_sources(scene: SceneMap, view: View, prior: Prior, frame: int, settin
     missing = 2 * len(settings.parallax_px) - len(chosen)
     if missing > 0:
         middle = float(np.sqrt(settings.parallax_px[0] * settings.parallax_px[-1])) * scale
-        left = [int(i) for i in np.flatnonzero(usable) if i not in chosen]
+        left = [i for i in np.flatnonzero(usable).tolist() if i not in chosen]
         left.sort(key=lambda i: (abs(np.log(parallax[i] / middle)), i))
         chosen += left[:missing]
     return sorted(int(candidates[i]) for i in chosen)

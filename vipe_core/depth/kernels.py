@@ -305,7 +305,7 @@ def check(
                 rotation[1, 0] * a + rotation[1, 1] * b + rotation[1, 2] * c + translation[1] * d,
                 rotation[2, 0] * a + rotation[2, 1] * b + rotation[2, 2] * c + translation[2] * d,
             )
-            ui, vi = int(math.floor(u + 0.5)), int(math.floor(v + 0.5))
+            ui, vi = math.floor(u + 0.5), math.floor(v + 0.5)
             if length <= 0 or ui < 0 or vi < 0 or ui >= w or vi >= h:
                 continue
             predicted = d / length
@@ -339,11 +339,11 @@ def upsample(
     weight, value, trust = np.empty(4, np.float32), np.empty(4, np.float32), np.empty(4, np.float32)
     for y in range(rows):
         v = (y + 0.5) * h / rows - 0.5
-        v0 = int(math.floor(v))
+        v0 = math.floor(v)
         fv = v - v0
         for x in range(cols):
             u = (x + 0.5) * w / cols - 0.5
-            u0 = int(math.floor(u))
+            u0 = math.floor(u)
             fu = u - u0
             heaviest = 0
             for i in range(4):

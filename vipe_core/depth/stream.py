@@ -25,11 +25,15 @@ from vipe_core.video.source import Frame, FrameSource
 
 Array = NDArray[Any]
 
-# What a completion filter believes the keyframes, relative to a confirmed measurement, where nothing was confirmed.
-_PRIOR_SHARE = 0.2
-_MIN_SCORE = 0.2
-_EDGE = 6.0
-_SAME = 0.05
+# A correlation of the first says nothing, of the second as much as it can.
+_MIN_SCORE, _SURE_SCORE = 0.2, 0.7
+# Belief in a value of high correlation when there is no other frame to ask, and the least belief that counts.
+_LONE_BELIEF, _MIN_BELIEF = 0.4, 0.2
+_LEAST_WEIGHT = 0.2
+# Without parallax, the keyframes' values go out with this share of their own confidence.
+_PRIOR_SHARE = 0.3
+# Enlarging: grey levels that lower a weight by e, and the relative difference that is still the same surface.
+_EDGE, _SAME = 6.0, 0.05
 
 
 class DenseDepth:
@@ -59,7 +63,7 @@ class DenseDepth:
         halves: dict[int, Array] = {}
         raws: dict[int, RawDepth] = {}
         priors: dict[int, Prior] = {}
-        with closing(_guarded(source.frames(size=size))) as ahead, closing(_guarded(source.frames())) as behind:
+        with closing(source.frames(size=size)) as ahead, closing(source.frames()) as behind:
             decoded = 0
             for t in range(num_frames + reach):
                 if t < num_frames:
@@ -92,8 +96,8 @@ class DenseDepth:
         height, width = half.shape
         prior_value = cv2.resize(prior.inverse_depth, (width, height), interpolation=cv2.INTER_LINEAR)
         prior_trust = cv2.resize(prior.confidence, (width, height), interpolation=cv2.INTER_LINEAR)
-        value, confidence = raw.inverse_depth, np.zeros_like(gray)
         if raw.measured:
+            value = raw.inverse_depth
             votes, ratios = np.zeros_like(gray), np.zeros_like(gray)
             asked = 0
             for j in (index + s * d for d in settings.check_frames for s in (-1, 1)):
@@ -115,29 +119,26 @@ class DenseDepth:
                     ratios,
                 )
             agrees = prior_trust * (np.abs(value / prior_value - 1) < settings.check_tolerance)
-            share = votes / asked if asked else np.zeros_like(votes)
-            confidence = np.maximum(share, 0.5 * agrees) * np.clip((raw.score - _MIN_SCORE) / 0.5, 0.05, 1)
-            confidence[np.maximum(share, agrees) < 0.3] = 0
+            # Without neighbours to ask, a high correlation has to do.
+            share = votes / asked if asked else (raw.score > _SURE_SCORE) * np.float32(_LONE_BELIEF)
+            believed = np.maximum(share, 0.5 * agrees)
+            confidence = believed * np.clip((raw.score - _MIN_SCORE) / (_SURE_SCORE - _MIN_SCORE), 0.05, 1)
+            confidence[believed < _MIN_BELIEF] = 0
             value = value * (1 + ratios) / (1 + votes)
-        weight = np.where(confidence > 0, np.maximum(confidence, 0.2), _PRIOR_SHARE * prior_trust)
-        start = np.where(confidence > 0, value, prior_value)
-        filled = complete(start, weight.astype(np.float32), gray, prior_value)
-        filled = np.clip(filled, 0.2 * prior.low, 4 * prior.high)
-        # A value that only the keyframes know counts as measured as far as they are sure.
-        confidence = np.where(confidence > 0, confidence, 0.3 * prior_trust)
+            confidence = confidence.astype(np.float32)
+            weight = np.where(confidence > 0, np.maximum(confidence, _LEAST_WEIGHT), 0).astype(np.float32)
+            value = complete(value, weight, gray, prior_value)
+        else:
+            value, confidence = prior_value, (_PRIOR_SHARE * prior_trust).astype(np.float32)
+        value = np.clip(value, 0.2 * prior.low, 4 * prior.high).astype(np.float32)
         full_gray = cv2.cvtColor(picture.rgb, cv2.COLOR_RGB2GRAY)
-        depth, sure = upsample(filled.astype(np.float32), confidence.astype(np.float32), gray, full_gray, _EDGE, _SAME)
+        depth, sure = upsample(value, confidence, gray, full_gray, _EDGE, _SAME)
         return DepthFrame(index, picture.rgb, depth, np.clip(sure, 0, 1))
 
 
 def _half_gray(frame: Frame) -> NDArray[np.uint8]:
     gray = cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY)
     return np.asarray(cv2.resize(gray, (gray.shape[1] // 2, gray.shape[0] // 2), interpolation=cv2.INTER_AREA))
-
-
-def _guarded(frames: Iterator[Frame]) -> Iterator[Frame]:
-    """A generator over any iterator, so that it can be closed."""
-    yield from frames
 
 
 def _next(frames: Iterator[Frame], index: int, num_frames: int) -> Frame:

@@ -34,7 +34,7 @@ class DepthSettings:
     """
 
     window_frames: int = 60
-    parallax_px: tuple[float, float] = (5.0, 13.0)
+    parallax_px: tuple[float, float] = (3.5, 9.0)
     min_parallax_px: float = 0.7
     min_overlap: float = 0.5
     planes: int = 48
@@ -43,10 +43,10 @@ class DepthSettings:
     coarse_radius: int = 2
     fine_radius: int = 2
     noise: float = 2.0
-    smooth_small: float = 0.05
-    smooth_large: float = 0.6
+    smooth_small: float = 0.1
+    smooth_large: float = 1.2
     smooth_edge: float = 12.0
-    prior_gain: float = 0.3
+    prior_gain: float = 0.2
     prior_reach: float = 3.0
     check_frames: tuple[int, ...] = (3, 6)
     check_tolerance: float = 0.03
