@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from typing import Any
 
 import pyarrow as pa
@@ -19,6 +20,15 @@ Row = dict[str, Any]
 _NEEDED = {"sequence", "num_frames", "tar_name"}
 
 
+@contextmanager
+def parquet_errors(where: str) -> Iterator[None]:
+    """Damage that the parquet library finds, as IntegrityError. (It reports a damaged page as OSError.)"""
+    try:
+        yield
+    except (pa.ArrowException, OSError) as error:
+        raise IntegrityError(f"{where} is not a readable parquet file; finalise the job again") from error
+
+
 class DatasetIndex:
     """`meta.parquet` of an output. Use as a context manager.
 
@@ -28,17 +38,18 @@ class DatasetIndex:
     """
 
     def __init__(self, store: ObjectStore) -> None:
-        where = f"{store.uri}/{META_KEY}"
+        self._where = f"{store.uri}/{META_KEY}"
         self._source = open_object(store, META_KEY)
         try:
-            self._file = pq.ParquetFile(pa.PythonFile(self._source, mode="r"))
-        except pa.ArrowInvalid as error:
+            with parquet_errors(self._where):
+                self._file = pq.ParquetFile(pa.PythonFile(self._source, mode="r"))
+        except BaseException:
             self._source.close()
-            raise IntegrityError(f"{where} is not a parquet file; finalise the job again") from error
+            raise
         self.columns: tuple[str, ...] = tuple(self._file.schema_arrow.names)
         if missing := _NEEDED - set(self.columns):
             self.close()
-            raise IntegrityError(f"{where} has no column {sorted(missing)[0]!r}")
+            raise IntegrityError(f"{self._where} has no column {sorted(missing)[0]!r}")
 
     def __enter__(self) -> DatasetIndex:
         return self
@@ -55,17 +66,23 @@ class DatasetIndex:
 
     def rows(self, columns: Sequence[str] | None = None) -> Iterator[Row]:
         """Rows in file order, in bounded memory."""
-        for batch in self._file.iter_batches(batch_size=1000, columns=None if columns is None else list(columns)):
+        batches = self._file.iter_batches(batch_size=1000, columns=None if columns is None else list(columns))
+        while True:
+            with parquet_errors(self._where):
+                batch = next(batches, None)
+            if batch is None:
+                return
             yield from batch.to_pylist()
 
     def row(self, key: str) -> Row | None:
         """The row of one sequence. Reads the column of names, then one row group."""
-        for number in range(self._file.num_row_groups):
-            names = self._file.read_row_group(number, columns=["sequence"])["sequence"]
-            position = pc.index(names.cast(pa.string()), key).as_py()
-            if position >= 0:
-                row: Row = self._file.read_row_group(number).slice(position, 1).to_pylist()[0]
-                return row
+        with parquet_errors(self._where):
+            for number in range(self._file.num_row_groups):
+                names = self._file.read_row_group(number, columns=["sequence"])["sequence"]
+                position = pc.index(names.cast(pa.string()), key).as_py()
+                if position >= 0:
+                    row: Row = self._file.read_row_group(number).slice(position, 1).to_pylist()[0]
+                    return row
         return None
 
     def shards(self) -> Iterator[tuple[str, dict[str, Row]]]:
@@ -81,7 +98,7 @@ class DatasetIndex:
                 previous = str(row["tar_name"])
                 together = together and previous not in runs
                 runs.add(previous)
-        rows = self.rows() if together else iter(self._file.read().sort_by("tar_name").to_pylist())
+        rows = self.rows() if together else iter(sorted(self.rows(), key=lambda row: str(row["tar_name"])))
         name: str | None = None
         group: dict[str, Row] = {}
         for row in rows:

@@ -15,7 +15,7 @@ import pyarrow.parquet as pq
 from services.commit.reconcile import committed_records
 from services.commit.verify import check_keys, check_members, index_tar, sha256_of
 from services.dataset.finalise import Completeness, Totals
-from services.dataset.index import DatasetIndex
+from services.dataset.index import DatasetIndex, parquet_errors
 from services.dataset.schema import DATASET_KEY, FAILURES_KEY, META_KEY
 from services.domain.errors import IntegrityError, ObjectMissing
 from services.domain.models import CommitRecord, PayloadObject
@@ -158,12 +158,10 @@ def _described_shards(described: dict[str, Any]) -> Iterator[tuple[Any, ...]]:
 
 def _failures(store: ObjectStore) -> Iterator[tuple[Any, ...]]:
     with open_object(store, FAILURES_KEY) as file:
-        try:
-            parquet = pq.ParquetFile(pa.PythonFile(file, mode="r"))
-            for batch in parquet.iter_batches(columns=list(_FAILURE_COLUMNS)):
-                yield from (tuple(row.values()) for row in batch.to_pylist())
-        except pa.ArrowInvalid as error:
-            raise IntegrityError(f"{FAILURES_KEY} is not a parquet file; finalise the job again") from error
+        with parquet_errors(FAILURES_KEY):
+            table = pq.read_table(pa.PythonFile(file, mode="r"), columns=list(_FAILURE_COLUMNS))
+        for batch in table.to_batches(max_chunksize=1000):
+            yield from (tuple(row.values()) for row in batch.to_pylist())
 
 
 def _read_back(store: ObjectStore, record: CommitRecord, o: PayloadObject, report: Report) -> int:
