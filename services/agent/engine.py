@@ -29,7 +29,7 @@ _SHARES: dict[str, tuple[float, float]] = {
     "scan": (0.0, 0.1),
     "track": (0.1, 0.6),
     "infill": (0.6, 0.7),
-    "dense": (0.7, 1.0),
+    "depth": (0.7, 1.0),
 }
 
 
@@ -79,7 +79,7 @@ class VipeEngine:
 
         annotation = self._annotator.annotate(path, name=video.key, progress=during)
         write_artifacts(
-            annotation, root, attributes=attributes, progress=lambda done, all_: report("dense", done, all_)
+            annotation, root, attributes=attributes, progress=lambda done, all_: report("depth", done, all_)
         )
         return index_row(annotation, video)
 

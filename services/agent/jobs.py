@@ -97,7 +97,7 @@ class JobKeeper:
         return True
 
     def _finalise_job(self, job: Job) -> None:
-        from services.dataset.finalise import finalise  # Slow to import; see `services.agent.commits`.
+        from services.dataset import finalise  # Slow to import; see `services.agent.commits`.
 
         backoff = self._finalising.setdefault(job.id, self._backoff())
         started = self._clock()

@@ -76,7 +76,7 @@ class ScriptedEngine:
             time.sleep(0.05)
         annotation = fake_annotation(video.key, frames)
         write_artifacts(annotation, root, attributes=["pose", "intrinsics", "depth"])
-        progress("dense", frames, frames, 1.0)
+        progress("depth", frames, frames, 1.0)
         return index_row(annotation, video)
 
     def _die(self) -> None:

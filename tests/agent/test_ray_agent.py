@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
+from agent_clips import write_assorted_inputs
 from agent_rig import Rig
 
 from services.agent.agent import Agent
@@ -62,8 +63,8 @@ def _submit(store: SqlStore, root: Path, scripts: dict[str, str], *, shard_max_v
     return store.create_job(spec)[0].id
 
 
-def _finished(store: SqlStore, job_id: str) -> Job:
-    _wait(lambda: store.get_job(job_id).state.terminal, f"{job_id} to end")
+def _finished(store: SqlStore, job_id: str, seconds: float = 120.0) -> Job:
+    _wait(lambda: store.get_job(job_id).state.terminal, f"{job_id} to end", seconds)
     return store.get_job(job_id)
 
 
@@ -232,3 +233,38 @@ def test_kill_9_of_the_agent_loses_and_doubles_nothing(tmp_path: Path) -> None:
     assert all(tried[f"v{number}"] == 1 for number in range(4))
     assert sum(tried.values()) <= len(scripts) + 1
     store.close()
+
+
+def test_the_real_engine_on_what_users_drop_into_a_folder(tmp_path: Path) -> None:
+    """One clip that works beside a cut one, an empty one, a text, one picture and a sound: a row for each."""
+    write_assorted_inputs(tmp_path / "inputs")
+    store, metrics = SqlStore(f"sqlite:///{tmp_path}/vipe.db"), Metrics()
+    config = AgentConfig(scratch_dir=tmp_path / "scratch", poll_s=0.2)
+    agent = Agent(store, config, RayExecutor(config), metrics)
+    job_id = store.create_job(JobSpec((str(tmp_path / "inputs"),), str(tmp_path / "out")))[0].id
+    agent.start()
+    try:
+        job = _finished(store, job_id, 240)
+    finally:
+        agent.stop()
+        store.close()
+    rows = _rows(tmp_path, job_id)
+    assert job.state is JobState.SUCCEEDED_WITH_ERRORS
+    assert {name: row.error_code for name, row in rows.items()} == {
+        "good": None,
+        "one-frame": None,
+        "corrupt": "media_corrupt",
+        "empty": "media_empty",
+        "text": "media_corrupt",
+        "audio": "no_video_stream",
+    }
+    good = rows["good"]
+    assert (good.num_frames, good.width, good.height, good.camera_model) == (16, 128, 96, "pinhole")
+    assert good.quality is not None
+    assert good.provenance is not None
+    assert good.timings_s is not None
+    assert rows["one-frame"].quality is not None
+    assert "few_frames" in rows["one-frame"].quality["reasons"]
+    assert all(name in str(rows[name].error_message) for name in ("corrupt", "empty", "text", "audio"))
+    assert (tmp_path / "out" / "meta.parquet").exists()
+    assert not list((tmp_path / "scratch").glob("job_*"))
