@@ -53,7 +53,6 @@ class Annotator:
         self.device = resolve_device(device)
         self.threads = threads
         set_threads(threads)
-        self._slam = Slam(classical_priors(), self.preset.slam, self.device)
 
     def annotate(
         self, path: str | Path, *, name: str | None = None, progress: ProgressCallback | None = None
@@ -74,8 +73,11 @@ class Annotator:
             if progress is not None:
                 progress(Progress(stage, done, total))
 
+        # New matchers for each video: OpenCV's flow object keeps buffers of the last picture size and is not safe to
+        # use with another one, and nothing of one video may reach the next.
+        slam = Slam(classical_priors(), self.preset.slam, self.device)
         with torch.inference_mode():
-            result = self._slam.run(source, report)
+            result = slam.run(source, report)
         quality = assess(result, self.preset.slam, source.info.width)
         timings = dict(result.timings_s)
         logger.info(

@@ -74,6 +74,8 @@ class Adjuster:
         self.device = device
         self.focal_prior = focal_prior
         self.robust_scale_px = settings.robust_scale_px * scale_px
+        # The cost is in px^2 of the working image: a smaller image has smaller residuals for the same geometry.
+        self._depth_prior_weight = settings.depth_prior_weight * scale_px**2
 
     def adjust(
         self,
@@ -183,5 +185,5 @@ class Adjuster:
             [smooth_inverse_depth(depths[row], confidence[row], keyframes.grid) for row in range(len(frames))]
         )
         median = max(float(np.median(depths)), 1e-6)
-        information = np.full(depths.shape, self.settings.depth_prior_weight / median**2, dtype=np.float32)
+        information = np.full(depths.shape, self._depth_prior_weight / median**2, dtype=np.float32)
         return torch.from_numpy(prior).to(self.device), torch.from_numpy(information).to(self.device)

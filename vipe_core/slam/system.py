@@ -147,7 +147,14 @@ class Slam:
                 frame_inliers = np.ones(selection.num_frames, dtype=np.float32)
                 report("infill", selection.num_frames, selection.num_frames)
             else:
-                infill = Infill(keyframes, self._priors.matcher, adjuster, reprojector, self._settings.infill_batch)
+                infill = Infill(
+                    keyframes,
+                    self._priors.matcher,
+                    adjuster,
+                    reprojector,
+                    self._settings.infill_batch,
+                    fitter if motion == "rotation" else None,
+                )
                 trajectory = infill.run(source, size, selection.timestamps_s, report)
                 cam_from_world, frame_inliers = trajectory.cam_from_world, trajectory.inlier_ratio
         world_from_cam = inverse(cam_from_world)

@@ -1,0 +1,104 @@
+"""A wavy wall seen by a moving camera, with exact measurements: what SLAM can do when matching is perfect."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vipe_core.ba.problem import Grid
+from vipe_core.cameras import Camera
+from vipe_core.geometry.arrays import exp, inverse
+from vipe_core.priors.protocols import IntrinsicsEstimate, Match, PriorFamily, WorkingFrame
+from vipe_core.slam.reprojection import Reprojector
+from vipe_core.video.source import Frame, VideoInfo
+
+WIDTH, HEIGHT = 192, 144
+GRID = Grid(HEIGHT // 8, WIDTH // 8)
+CAMERA = Camera.pinhole_from_fov(60.0, WIDTH, HEIGHT)
+
+
+def trajectory(count: int, step: Sequence[float]) -> NDArray[np.float64]:
+    """(N, 4, 4) cam_from_world of a constant twist per frame (translation, rotation)."""
+    return np.stack([exp(np.array(step) * k) for k in range(count)])
+
+
+class ExactScene:
+    """Truth and the providers that measure it without error.
+
+    The world is one wavy wall z = f(x, y) that the rays of every frame are intersected with.
+
+    Args:
+        outliers: Share of cells whose measurement is noise.
+    """
+
+    def __init__(self, cam_from_world: NDArray[np.float64], *, outliers: float = 0.0) -> None:
+        self.cam_from_world = cam_from_world
+        self.reprojector = Reprojector("pinhole", GRID)
+        self.params = CAMERA.index_params()
+        self.inverse_depth = [self._intersect(pose) for pose in cam_from_world]
+        self._outliers = outliers
+
+    def _intersect(self, cam_from_world: NDArray[np.float64]) -> NDArray[np.float64]:
+        world_from_cam = inverse(cam_from_world)
+        px = GRID.sample_px().numpy()
+        rays = np.concatenate([(px - self.params[2:4]) / self.params[:2], np.ones((len(px), 1))], axis=1)
+        rays, centre = rays @ world_from_cam[:3, :3].T, world_from_cam[:3, 3]
+        depth = np.full(len(rays), 3.0)
+        for _ in range(60):
+            point = centre + depth[:, None] * rays
+            wall = 3.0 + 0.7 * np.sin(1.7 * point[:, 0]) * np.cos(1.3 * point[:, 1])
+            depth = depth + 0.5 * (wall - point[:, 2]) / rays[:, 2]
+        return 1.0 / depth
+
+    def measure(self, i: int, j: int) -> Match:
+        relative = self.cam_from_world[j] @ inverse(self.cam_from_world[i])
+        induced = self.reprojector.induced(self.params, relative, self.inverse_depth[i])
+        target_px = np.nan_to_num(induced.target_px)
+        rng = np.random.default_rng(1000 * i + j)
+        wrong = rng.random(len(target_px)) < self._outliers
+        target_px[wrong] += rng.normal(0, 15, (int(wrong.sum()), 2)).astype(np.float32)
+        weight = np.repeat(induced.visible[:, None], 2, axis=1).astype(np.float32)
+        return Match(target_px, weight, float(induced.visible.mean()))
+
+    # -- the providers; the features of a frame are its index ------------------------------------------------------
+
+    def encode(self, frame: WorkingFrame) -> int:
+        return frame.index
+
+    def motion_px(self, source: int, target: int) -> float:
+        match = self.measure(source, target)
+        seen = match.weight[:, 0] > 0
+        moved = np.linalg.norm(match.target_px - GRID.sample_px().numpy(), axis=1)
+        return float(np.median(moved[seen])) if seen.any() else 0.0
+
+    def match(self, source: int, target: int, guess_px: object = None) -> tuple[Match, Match]:
+        return self.measure(source, target), self.measure(target, source)
+
+    def match_fast(self, source: int, target: int, guess_px: object = None) -> Match:
+        return self.measure(source, target)
+
+    def priors(self, fov_deg: float = 60.0, sigma: float = 0.1) -> PriorFamily:
+        """The scene as its own matcher, and an initial camera of the given field of view."""
+        return PriorFamily(matcher=self, tracker=None, intrinsics=_Guess(fov_deg, sigma))
+
+    # -- the frame source: pictures are blank, only their number counts --------------------------------------------
+
+    @property
+    def info(self) -> VideoInfo:
+        return VideoInfo("exact", "exact", WIDTH, HEIGHT, 30.0, None, None, 0, "none", "rgb24", 0)
+
+    def frames(self, size: tuple[int, int] | None = None, start: int = 0, stop: int | None = None) -> Iterator[Frame]:
+        blank = np.zeros((HEIGHT, WIDTH, 3), dtype=np.uint8)
+        for index in range(len(self.cam_from_world))[start:stop]:
+            yield Frame(index, index / 30.0, blank)
+
+
+class _Guess:
+    def __init__(self, fov_deg: float, sigma: float) -> None:
+        self._fov_deg, self._sigma = fov_deg, sigma
+
+    def estimate(self, frames: Sequence[WorkingFrame], grid: Grid) -> IntrinsicsEstimate:
+        camera = Camera.pinhole_from_fov(self._fov_deg, grid.width * 8, grid.height * 8)
+        return IntrinsicsEstimate(camera, self._sigma, 1)
