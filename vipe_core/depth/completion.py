@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 Array = NDArray[Any]
 
-_RADII = (3, 8, 20, 48)
+_RADII = (3, 6, 12, 24, 48)
 _EDGE_VARIANCE = 60.0
 _MIN_SUPPORT = 0.02
 

@@ -69,6 +69,134 @@ def _window_statistics(image: Array, radius: int) -> tuple[Array, Array]:
 
 
 @_compiled
+def _warp_pinhole(
+    image: Array, turned: Array, t: Array, base: Array, offset: float, params: Array, warped: Array, seen: Array
+) -> None:
+    """Samples `image` at every pixel for the inverse depths `base + offset`, all in float32 for speed."""
+    h, w = base.shape
+    fx, fy, cx, cy = params[0], params[1], params[2], params[3]
+    tx, ty, tz = t[0], t[1], t[2]
+    zero, one, tiny = np.float32(0), np.float32(1), np.float32(1e-6)
+    right, bottom = np.float32(w - 1), np.float32(h - 1)
+    for y in range(h):
+        for x in range(w):
+            d = max(zero, base[y, x] + offset)
+            z = turned[y, x, 2] + tz * d
+            if z > tiny:
+                inverse = one / z
+                u = fx * (turned[y, x, 0] + tx * d) * inverse + cx
+                v = fy * (turned[y, x, 1] + ty * d) * inverse + cy
+                if u >= zero and v >= zero and u <= right and v <= bottom:
+                    ui, vi = np.uint32(min(np.int32(u), w - 2)), np.uint32(min(np.int32(v), h - 2))
+                    fu, fv = u - np.float32(ui), v - np.float32(vi)
+                    upper = image[vi, ui] + fu * (image[vi, ui + 1] - image[vi, ui])
+                    lower = image[vi + 1, ui] + fu * (image[vi + 1, ui + 1] - image[vi + 1, ui])
+                    warped[y, x] = upper + fv * (lower - upper)
+                    seen[y, x] = one
+                    continue
+            warped[y, x] = zero
+            seen[y, x] = zero
+
+
+@_compiled
+def _warp(
+    image: Array,
+    turned: Array,
+    t: Array,
+    base: Array,
+    offset: float,
+    model: int,
+    params: Array,
+    warped: Array,
+    seen: Array,
+) -> None:
+    """`_warp_pinhole` for any camera model."""
+    h, w = base.shape
+    for y in range(h):
+        for x in range(w):
+            d = max(np.float32(0), base[y, x] + offset)
+            u, v, length = _project(
+                model, params, turned[y, x, 0] + t[0] * d, turned[y, x, 1] + t[1] * d, turned[y, x, 2] + t[2] * d
+            )
+            if length > 0 and u >= 0 and v >= 0 and u <= w - 1 and v <= h - 1:
+                ui, vi = min(int(u), w - 2), min(int(v), h - 2)
+                fu, fv = np.float32(u - ui), np.float32(v - vi)
+                upper = image[vi, ui] + fu * (image[vi, ui + 1] - image[vi, ui])
+                lower = image[vi + 1, ui] + fu * (image[vi + 1, ui + 1] - image[vi + 1, ui])
+                warped[y, x] = upper + fv * (lower - upper)
+                seen[y, x] = 1
+            else:
+                warped[y, x] = 0
+                seen[y, x] = 0
+
+
+@_compiled
+def _correlate(
+    reference: Array,
+    mean: Array,
+    gain: Array,
+    warped: Array,
+    seen: Array,
+    radius: int,
+    noise: float,
+    first: Array,
+    second: Array,
+    count: Array,
+) -> None:
+    """Correlation of all windows with the warped image; keeps the best two scores and counts the sources.
+
+    Column sums move down one row at a time; row sums are differences of prefix sums. The last loop has no branches, so
+    that the compiler can vectorise its root and its division.
+    """
+    h, w = reference.shape
+    col = np.zeros((4, w), np.float64)
+    prefix = np.zeros((4, w + 2 * radius + 2), np.float64)
+    one, outside, floor = np.float32(1), np.float32(-2), np.float32(noise)
+    for y in range(-radius, h):
+        enter, leave = y + radius, y - radius - 1
+        if enter < h:
+            for x in range(w):
+                j = warped[enter, x]
+                col[0, x] += j
+                col[1, x] += j * j
+                col[2, x] += j * reference[enter, x]
+                col[3, x] += seen[enter, x]
+        if leave >= 0:
+            for x in range(w):
+                j = warped[leave, x]
+                col[0, x] -= j
+                col[1, x] -= j * j
+                col[2, x] -= j * reference[leave, x]
+                col[3, x] -= seen[leave, x]
+        if y < 0:
+            continue
+        # prefix[x + radius + 1] is the sum of columns 0..x, flat on both sides.
+        s0, s1, s2, s3 = 0.0, 0.0, 0.0, 0.0
+        for x in range(w):
+            s0, s1, s2, s3 = s0 + col[0, x], s1 + col[1, x], s2 + col[2, x], s3 + col[3, x]
+            i = x + radius + 1
+            prefix[0, i], prefix[1, i], prefix[2, i], prefix[3, i] = s0, s1, s2, s3
+        for i in range(w + radius + 1, w + 2 * radius + 2):
+            prefix[0, i], prefix[1, i], prefix[2, i], prefix[3, i] = s0, s1, s2, s3
+        rows = min(h, enter + 1) - max(0, leave + 1)
+        for x in range(w):
+            n = np.float32(rows * (min(w, x + radius + 1) - max(0, x - radius)))
+            share = one / n
+            i = x + 2 * radius + 1
+            mj = np.float32(prefix[0, i] - prefix[0, x]) * share
+            jj = np.float32(prefix[1, i] - prefix[1, x]) * share
+            ij = np.float32(prefix[2, i] - prefix[2, x]) * share
+            whole = np.float32(prefix[3, i] - prefix[3, x]) > n - np.float32(0.5)
+            spread = max(np.float32(0), jj - mj * mj) + floor
+            value = (ij - mj * mean[y, x]) * gain[y, x] / np.float32(math.sqrt(spread))
+            score = value if whole else outside
+            best = first[y, x]
+            second[y, x] = max(second[y, x], min(best, score))
+            first[y, x] = max(best, score)
+            count[y, x] += np.uint8(whole)
+
+
+@_compiled
 def sweep_cost(
     reference: Array,
     rays: Array,
@@ -105,92 +233,39 @@ def sweep_cost(
     """
     h, w = reference.shape
     num_planes, num_sources = len(offsets), len(sources)
-    mean, variance = _window_statistics(reference, radius)
+    # Grey levels around zero keep the products small for float32.
+    level = np.float32(reference.mean())
+    centred = reference - level
+    mean, variance = _window_statistics(centred, radius)
+    gain = (1 / np.sqrt(variance + np.float32(noise))).astype(np.float32)
     first = np.full((num_planes, h, w), np.float32(-2), np.float32)
     second = np.full((num_planes, h, w), np.float32(-2), np.float32)
     count = np.zeros((num_planes, h, w), np.uint8)
     turned = np.empty((h, w, 3), np.float32)
     warped, seen = np.empty((h, w), np.float32), np.empty((h, w), np.float32)
-    col = np.zeros((4, w), np.float64)
     for s in range(num_sources):
-        r, t, image = rotations[s], translations[s], sources[s]
+        r, t, image = rotations[s], translations[s], sources[s] - level
         for y in range(h):
             for x in range(w):
                 for c in range(3):
                     turned[y, x, c] = r[c, 0] * rays[y, x, 0] + r[c, 1] * rays[y, x, 1] + r[c, 2] * rays[y, x, 2]
         for k in range(num_planes):
-            for y in range(h):
-                for x in range(w):
-                    d = max(np.float32(0), base[y, x] + offsets[k])
-                    u, v, length = _project(
-                        model,
-                        params,
-                        turned[y, x, 0] + t[0] * d,
-                        turned[y, x, 1] + t[1] * d,
-                        turned[y, x, 2] + t[2] * d,
-                    )
-                    if length > 0 and u >= 0 and v >= 0 and u <= w - 1 and v <= h - 1:
-                        ui, vi = min(int(u), w - 2), min(int(v), h - 2)
-                        fu, fv = np.float32(u - ui), np.float32(v - vi)
-                        top = image[vi, ui] + fu * (image[vi, ui + 1] - image[vi, ui])
-                        bottom = image[vi + 1, ui] + fu * (image[vi + 1, ui + 1] - image[vi + 1, ui])
-                        warped[y, x] = top + fv * (bottom - top)
-                        seen[y, x] = 1
-                    else:
-                        warped[y, x] = 0
-                        seen[y, x] = 0
-            col[:] = 0
-            for y in range(-radius, h):
-                # Column sums of the rows y - radius .. y + radius, moved down one row at a time.
-                if y + radius < h:
-                    for x in range(w):
-                        j = warped[y + radius, x]
-                        col[0, x] += j
-                        col[1, x] += j * j
-                        col[2, x] += j * reference[y + radius, x]
-                        col[3, x] += seen[y + radius, x]
-                if y - radius - 1 >= 0:
-                    for x in range(w):
-                        j = warped[y - radius - 1, x]
-                        col[0, x] -= j
-                        col[1, x] -= j * j
-                        col[2, x] -= j * reference[y - radius - 1, x]
-                        col[3, x] -= seen[y - radius - 1, x]
-                if y < 0:
-                    continue
-                rows = min(h, y + radius + 1) - max(0, y - radius)
-                sj, sjj, sij, sn = 0.0, 0.0, 0.0, 0.0
-                for x in range(min(radius, w)):
-                    sj, sjj, sij, sn = sj + col[0, x], sjj + col[1, x], sij + col[2, x], sn + col[3, x]
-                for x in range(w):
-                    if x + radius < w:
-                        i = x + radius
-                        sj, sjj, sij, sn = sj + col[0, i], sjj + col[1, i], sij + col[2, i], sn + col[3, i]
-                    if x - radius - 1 >= 0:
-                        i = x - radius - 1
-                        sj, sjj, sij, sn = sj - col[0, i], sjj - col[1, i], sij - col[2, i], sn - col[3, i]
-                    n = rows * (min(w, x + radius + 1) - max(0, x - radius))
-                    if sn < n - 0.5:
-                        continue
-                    mj = sj / n
-                    covariance = sij / n - mj * mean[y, x]
-                    score = covariance / math.sqrt((variance[y, x] + noise) * (max(0.0, sjj / n - mj * mj) + noise))
-                    count[k, y, x] += 1
-                    if score > first[k, y, x]:
-                        second[k, y, x] = first[k, y, x]
-                        first[k, y, x] = score
-                    elif score > second[k, y, x]:
-                        second[k, y, x] = score
+            if model == 0:
+                _warp_pinhole(image, turned, t, base, offsets[k], params, warped, seen)
+            else:
+                _warp(image, turned, t, base, offsets[k], model, params, warped, seen)
+            _correlate(centred, mean, gain, warped, seen, radius, noise, first[k], second[k], count[k])
     cost = np.empty((h, w, num_planes), np.float32)
-    for k in range(num_planes):
-        for y in range(h):
+    half = np.float32(0.5)
+    for y in range(h):
+        for k in range(num_planes):
             for x in range(w):
                 if count[k, y, x] == 0:
                     cost[y, x, k] = _FAR_COST
                 elif count[k, y, x] <= 2:
                     cost[y, x, k] = 1 - first[k, y, x]
                 else:
-                    cost[y, x, k] = 1 - 0.5 * (first[k, y, x] + second[k, y, x])
+                    cost[y, x, k] = 1 - half * (first[k, y, x] + second[k, y, x])
     return cost
 
 
