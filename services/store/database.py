@@ -77,6 +77,7 @@ class Tx:
             for job_id in sorted({e["job_id"] for e in self._events}):
                 self.conn.execute(select(func.pg_advisory_xact_lock(func.hashtextextended(job_id, 0))))
         self.conn.execute(insert(schema.events), self._events)
+        self._events.clear()
 
 
 class Database:

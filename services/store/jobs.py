@@ -17,7 +17,7 @@ from services.domain.events import EventKind, job_event
 from services.domain.models import JobSpec, ShardPlan, shard_id
 from services.domain.states import JOB_TRANSITIONS, JobState, ShardState, VideoStatus
 from services.store.database import Tx
-from services.store.schema import idempotency_keys, jobs, shards, videos
+from services.store.schema import idempotency_keys, in_state, jobs, shards, videos
 
 # Serialises the creation of jobs in PostgreSQL, so that ids grow and the check of the output cannot be overtaken.
 _CREATE_LOCK = 0x6A6F6273
@@ -50,7 +50,7 @@ def settle_cancelling(tx: Tx, job_id: str) -> None:
     job = lock_job(tx, job_id)
     if JobState(job.state) is not JobState.CANCELLING:
         return
-    leased = select(shards.c.id).where(shards.c.job_id == job_id, shards.c.state == ShardState.LEASED)
+    leased = select(shards.c.id).where(shards.c.job_id == job_id, in_state(shards.c.state, ShardState.LEASED))
     if tx.first(leased.limit(1)) is None:
         move_job(tx, job, JobState.CANCELLED)
 
@@ -248,6 +248,6 @@ def finish_job(tx: Tx, job_id: str) -> None:
 def _cancel_pending(tx: Tx, job_id: str) -> None:
     tx.run(
         update(shards)
-        .where(shards.c.job_id == job_id, shards.c.state == ShardState.PENDING)
+        .where(shards.c.job_id == job_id, in_state(shards.c.state, ShardState.PENDING))
         .values(state=ShardState.CANCELLED.value)
     )

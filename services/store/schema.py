@@ -11,6 +11,7 @@ from sqlalchemy import (
     Boolean,
     CheckConstraint,
     Column,
+    ColumnElement,
     DateTime,
     Dialect,
     ForeignKey,
@@ -22,6 +23,7 @@ from sqlalchemy import (
     Text,
     TypeDecorator,
     UniqueConstraint,
+    literal,
     text,
 )
 from sqlalchemy.dialects.postgresql import JSONB
@@ -66,6 +68,11 @@ metadata = MetaData(
 def _one_of(column: str, values: type[StrEnum]) -> CheckConstraint:
     names = ", ".join(f"'{value}'" for value in values)
     return CheckConstraint(f"{column} IN ({names})", name=column)
+
+
+def in_state(column: ColumnElement[str], state: StrEnum) -> ColumnElement[bool]:
+    """Compare with the state as a literal: with a bound value the planner could not use an index on that state only."""
+    return column == literal(state.value, literal_execute=True)
 
 
 def _count(name: str) -> Column[int]:
@@ -144,13 +151,13 @@ shards = Table(
     Column("committed_at", UtcDateTime),
     _one_of("state", ShardState),
     UniqueConstraint("job_id", "ordinal"),
-    Index("ix_shards_job_id_state_committed_at", "job_id", "state", "committed_at"),
+    Index("ix_shards_job_id_state_ordinal", "job_id", "state", "ordinal"),
     Index(
-        "ix_shards_claimable",
+        "ix_shards_committed",
         "job_id",
-        "ordinal",
-        sqlite_where=text("state = 'pending'"),
-        postgresql_where=text("state = 'pending'"),
+        "committed_at",
+        sqlite_where=text("state = 'committed'"),
+        postgresql_where=text("state = 'committed'"),
     ),
     Index(
         "ix_shards_expiring",

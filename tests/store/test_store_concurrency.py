@@ -12,8 +12,10 @@ from pathlib import Path
 
 from store_helpers import planned_job, plans, record, spec
 
+from services.domain.events import EventKind
 from services.domain.models import Lease
 from services.domain.states import JobState
+from services.store.database import Database, Tx
 from services.store.sql import SqlStore
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -117,6 +119,37 @@ def test_a_whole_job_by_many_agents(store: SqlStore) -> None:
     assert seen == [e.seq for e in store.events(job_id)]
     committed = [e.data["shard_id"] for e in store.events(job_id) if e.kind == "shard.committed"]
     assert len(committed) == len(set(committed)) == 24
+
+
+def test_events_become_visible_in_the_order_of_their_numbers(store: SqlStore, store_url: str) -> None:
+    """A transaction that took a number and is not committed yet holds back later numbers of the same job."""
+    job_id = planned_job(store, 1)
+    known = len(store.events(job_id))
+    numbered, may_commit = threading.Event(), threading.Event()
+    database = Database(store_url)
+
+    def slow(tx: Tx) -> None:
+        tx.emit(job_id, EventKind.SHARD_RELEASED, who="slow")
+        tx.flush_events()
+        numbered.set()
+        assert may_commit.wait(60)
+
+    def fast(tx: Tx) -> None:
+        tx.emit(job_id, EventKind.SHARD_RELEASED, who="fast")
+
+    slow_thread = threading.Thread(target=database.write, args=(slow,))
+    fast_thread = threading.Thread(target=database.write, args=(fast,))
+    slow_thread.start()
+    assert numbered.wait(60)
+    fast_thread.start()
+    fast_thread.join(timeout=1)
+    meanwhile = len(store.events(job_id))
+    may_commit.set()
+    slow_thread.join()
+    fast_thread.join()
+    database.close()
+    assert meanwhile == known, "the later number must not be seen before the earlier one"
+    assert [e.data.get("who") for e in store.events(job_id)[known:]] == ["slow", "fast"]
 
 
 def test_one_owner_per_output_and_one_job_per_key(store: SqlStore) -> None:

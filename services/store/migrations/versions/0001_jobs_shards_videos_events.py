@@ -106,22 +106,20 @@ def upgrade() -> None:
         sa.UniqueConstraint("job_id", "ordinal", name=op.f("uq_shards_job_id_ordinal")),
     )
     op.create_index(
-        "ix_shards_claimable",
+        "ix_shards_committed",
         "shards",
-        ["job_id", "ordinal"],
-        unique=False,
-        sqlite_where=sa.text("state = 'pending'"),
-        postgresql_where=sa.text("state = 'pending'"),
+        ["job_id", "committed_at"],
+        sqlite_where=sa.text("state = 'committed'"),
+        postgresql_where=sa.text("state = 'committed'"),
     )
     op.create_index(
         "ix_shards_expiring",
         "shards",
         ["lease_expires_at"],
-        unique=False,
         sqlite_where=sa.text("state = 'leased'"),
         postgresql_where=sa.text("state = 'leased'"),
     )
-    op.create_index("ix_shards_job_id_state_committed_at", "shards", ["job_id", "state", "committed_at"])
+    op.create_index("ix_shards_job_id_state_ordinal", "shards", ["job_id", "state", "ordinal"])
 
     op.create_table(
         "videos",
