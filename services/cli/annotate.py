@@ -51,10 +51,10 @@ def annotate(
             sys.stdout.flush()
     done = [row for row in rows if "error" not in row]
     if done and not as_json:
-        from services.cli.tables import annotation_table
+        from services.cli.tables import annotation_table, results_console
 
-        Console().print(annotation_table(done))
-        Console().print(f"Written to {output.resolve()}", highlight=False)
+        results_console().print(annotation_table(done))
+        results_console().print(f"Written to {output.resolve()}", soft_wrap=True)
     if len(done) < len(rows):
         raise typer.Exit(1)
 

@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
+from services.cli.addresses import absolute
+
 if TYPE_CHECKING:
     from services.dataset import Report
 
@@ -25,7 +27,7 @@ def verify(
     from services.dataset import verify as check
     from services.storage import open_store
 
-    report = check(open_store(output, endpoint_url=endpoint), deep=deep)
+    report = check(open_store(absolute(output), endpoint_url=endpoint), deep=deep)
     typer.echo(summary(report))
     for problem in report.problems:
         typer.echo(f"  {problem}", err=True)
@@ -53,7 +55,7 @@ def unpack(
     from services.dataset import unpack as unpack_dataset
     from services.storage import open_store
 
-    unpacked = unpack_dataset(open_store(output, endpoint_url=endpoint), destination, keys=key)
+    unpacked = unpack_dataset(open_store(absolute(output), endpoint_url=endpoint), destination, keys=key)
     typer.echo(f"{len(unpacked.names)} videos unpacked to {destination}")
 
 
@@ -76,7 +78,7 @@ def export(
         folder = Path(source)
         if not (folder / "pose").is_dir():
             folder = Path(scratch)
-            unpack_dataset(open_store(source, endpoint_url=endpoint), folder, keys=key)
+            unpack_dataset(open_store(absolute(source), endpoint_url=endpoint), folder, keys=key)
         names = [name for name in list_sequences(folder) if not key or name in key]
         for name in names:
             typer.echo(export_npz(folder, name, destination / f"{name}.{format}", depth_stride=depth_stride))

@@ -34,9 +34,9 @@ def demo(
     ] = Path("vipe_output/demo"),
 ) -> None:
     """Start the service, annotate sample videos (or yours) through it, check the output, and stop everything."""
-    from rich.console import Console
+    from services.cli.tables import results_console
 
-    console = Console(highlight=False)
+    console = results_console()
     output = output.resolve()
     _make_room(output)
     samples = _samples(output / "videos", console) if not videos else {}

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import json
 import sys
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+
+from services.cli.addresses import absolute
 
 if TYPE_CHECKING:
     from services.client import Client
@@ -24,11 +25,6 @@ def _client(api: str, api_key: str | None) -> Client:
     from services.client import Client
 
     return Client(api, api_key=api_key)
-
-
-def _address(text: str) -> str:
-    """Local paths become absolute, so that the service reads the same file; addresses with a scheme stay."""
-    return text if "://" in text else str(Path(text).expanduser().resolve()) + ("/" if text.endswith("/") else "")
 
 
 def _print_json(value: Any) -> None:
@@ -54,8 +50,8 @@ def submit(
     """Submit a job to a running service."""
     client = _client(api, api_key)
     spec = {
-        "inputs": [_address(item) for item in inputs],
-        "output": _address(output).rstrip("/"),
+        "inputs": [absolute(item) for item in inputs],
+        "output": absolute(output).rstrip("/"),
         "preset": preset,
         "camera": camera,
         "name": name,
@@ -71,8 +67,9 @@ def submit(
 
 def list_jobs(limit: int = 20, api: ApiUrl = DEFAULT_API, api_key: ApiKey = None, as_json: AsJson = False) -> None:
     """List jobs, newest first."""
-    from rich.console import Console
     from rich.table import Table
+
+    from services.cli.tables import results_console
 
     found = _client(api, api_key).jobs(limit=limit)
     if as_json:
@@ -87,7 +84,7 @@ def list_jobs(limit: int = 20, api: ApiUrl = DEFAULT_API, api_key: ApiKey = None
         failed = progress["videos_failed"] + progress["videos_quarantined"]
         counts = (f"{settled}/{progress['videos_total']}", str(failed), str(progress["frames_done"]))
         table.add_row(job["id"], job["state"], *counts, job["created_at"], job["spec"]["output"])
-    Console().print(table)
+    results_console().print(table)
 
 
 def status(job_id: str, api: ApiUrl = DEFAULT_API, api_key: ApiKey = None) -> None:
@@ -122,11 +119,9 @@ def videos(
         for video in found:
             sys.stdout.write(json.dumps(video) + "\n")
         return
-    from rich.console import Console
+    from services.cli.tables import annotation_table, results_console
 
-    from services.cli.tables import annotation_table
-
-    Console().print(annotation_table(video for video in found if video["status"] != "pending"))
+    results_console().print(annotation_table(video for video in found if video["status"] != "pending"))
 
 
 def cancel(job_id: str, api: ApiUrl = DEFAULT_API, api_key: ApiKey = None) -> None:

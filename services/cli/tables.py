@@ -2,13 +2,22 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterable, Mapping
+from pathlib import PurePosixPath
 from typing import Any
 
+from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+_LOG_WIDTH = 140
 _VERDICT_STYLE = {"yes": "green", "doubtful": "yellow", "no": "red"}
+
+
+def results_console() -> Console:
+    """Standard output; a file or pipe is as wide as the widest table, so that nothing is cut off in a log."""
+    return Console(highlight=False) if sys.stdout.isatty() else Console(highlight=False, width=_LOG_WIDTH)
 
 
 def _quality(quality: Mapping[str, Any] | None) -> Text:
@@ -38,7 +47,7 @@ def annotation_table(
         table.add_column("FOV err", justify="right", no_wrap=True)
     table.add_column("reliable")
     for row in rows:
-        name = str(row.get("name") or row.get("key"))
+        name = row.get("name") or PurePosixPath(row["uri"]).name
         if row.get("error_code"):
             blanks = [""] * (7 + (2 if scores else 0))
             table.add_row(name, *blanks, Text(f"{row['status']}: {row['error_code']}", style="red"))
@@ -57,7 +66,7 @@ def annotation_table(
             f"{row['trajectory_length']:.2f}{unit}",
         ]
         if scores:
-            score = scores.get(name)
+            score = scores.get(row["key"])
             cells += ["-", "-"] if score is None else [f"{score['ate_pct']:.2f}%", f"{score['fov_err_deg']:.2f}°"]
         table.add_row(*cells, _quality(row.get("quality")))
     return table

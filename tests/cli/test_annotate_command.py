@@ -1,0 +1,73 @@
+"""`vipectl annotate`: a video, a directory of images, and inputs that cannot be annotated."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from cli_helpers import Run
+
+from vipe_core.formats import read_artifacts
+from vipe_core.video import open_source
+
+pytestmark = pytest.mark.slow
+
+
+def test_videos_and_images_become_artifacts(vipectl: Run, clip: Path, tmp_path: Path) -> None:
+    images = tmp_path / "walk" / "sideways"
+    images.mkdir(parents=True)
+    for frame in open_source(clip).frames(stop=10):
+        cv2.imwrite(str(images / f"{frame.index:03d}.png"), cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2BGR))
+    broken = tmp_path / "broken.mp4"
+    broken.write_text("not a video")
+
+    done = vipectl("annotate", clip, broken, images, "-o", "out", "--json")
+
+    rows = [json.loads(line) for line in done.stdout.splitlines()]
+    assert done.returncode == 1, "one input failed"
+    assert [row.get("name") for row in rows] == ["sideways", None, "sideways-2"]
+    assert rows[1]["error"]["code"] == "media_corrupt"
+    assert "broken.mp4" in rows[1]["error"]["message"]
+    for row, frames in ((rows[0], 16), (rows[2], 10)):
+        artifacts = read_artifacts(tmp_path / "out", row["name"])
+        assert artifacts.num_frames == row["num_frames"] == frames
+        assert np.isfinite(artifacts.world_from_cam).all()
+        assert artifacts.camera.params == pytest.approx(row["camera_params"], rel=1e-6)
+        with artifacts.open_depth() as depth:
+            first = depth.read(0)
+        assert first.shape == (144, 192)
+        assert np.isfinite(first).all()
+        assert (first > 0).mean() > 0.99
+    sources = json.loads((tmp_path / "out/sequences.json").read_text())
+    assert sources == {"broken": str(broken), "sideways": str(clip), "sideways-2": str(images)}
+
+
+def test_the_table_for_people(vipectl: Run, clip: Path, tmp_path: Path) -> None:
+    shutil.copyfile(clip, tmp_path / "my clip.mp4")
+    done = vipectl("annotate", "my clip.mp4", "-o", "out")
+    assert done.returncode == 0, done.stderr
+    assert "my-clip" in done.stdout
+    assert "192x144" in done.stdout
+    assert (tmp_path / "out/depth/my-clip.zip").is_file()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "hint"),
+    [
+        (("--preset", "vipe9000"), "invalid_config", "classical"),
+        (("--camera", "fisheye"), "invalid_config", "pinhole"),
+        (("--device", "tpu"), "invalid_config", "cpu"),
+    ],
+)
+def test_what_is_not_offered_is_refused_with_what_is(
+    vipectl: Run, clip: Path, arguments: tuple[str, ...], code: str, hint: str
+) -> None:
+    done = vipectl("annotate", clip, "-o", "out", *arguments)
+    assert done.returncode == 1
+    assert f"[{code}]" in done.stderr
+    assert hint in done.stderr
+    assert "Traceback" not in done.stderr
