@@ -1,0 +1,83 @@
+"""The verdict follows from what the SLAM stage reports."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from vipe_core.annotation import Quality
+from vipe_core.cameras import Camera
+from vipe_core.quality import assess
+from vipe_core.slam import SlamResult, SlamSettings
+from vipe_core.slam.backend import FocalReport
+from vipe_core.slam.diagnostics import MapReport
+from vipe_core.slam.working import WorkingSize
+
+_FRAMES, _KEYFRAMES = 40, 10
+_WORKING = WorkingSize(320, 240)
+_CELLS = _WORKING.grid.num_cells
+
+
+def good_map(**changes: float) -> MapReport:
+    confidence = np.ones((_KEYFRAMES, _CELLS), dtype=np.float32)
+    report = MapReport(residual_px=0.1, inlier_ratio=0.99, coverage=0.9, parallax_deg=4.0, confidence=confidence)
+    return replace(report, **changes)  # type: ignore[arg-type]
+
+
+def good(**changes: object) -> SlamResult:
+    result = SlamResult(
+        world_from_cam=np.tile(np.eye(4), (_FRAMES, 1, 1)),
+        frame_inlier_ratio=np.ones(_FRAMES, dtype=np.float32),
+        timestamps_s=np.arange(_FRAMES) / 30.0,
+        keyframes=np.arange(_KEYFRAMES, dtype=np.int64) * 4,
+        inverse_depth=np.ones((_KEYFRAMES, _CELLS), dtype=np.float32),
+        static=np.ones((_KEYFRAMES, _CELLS), dtype=np.bool_),
+        working=_WORKING,
+        camera=Camera.pinhole_from_fov(60.0, 320, 240),
+        motion="general",
+        focal=FocalReport(0.01, observed=True),
+        map=good_map(),
+        timings_s={},
+    )
+    return replace(result, **changes)  # type: ignore[arg-type]
+
+
+def verdict(result: SlamResult) -> Quality:
+    return assess(result, SlamSettings(), source_width=640)
+
+
+def test_a_good_result_is_reliable_and_its_residual_is_in_source_pixels() -> None:
+    quality = verdict(good())
+    assert (quality.reliable, quality.reasons) == ("yes", ())
+    assert quality.residual_px == pytest.approx(0.2)
+
+
+@pytest.mark.parametrize(
+    ("result", "reason", "reliable"),
+    [
+        (good(motion="static"), "static_camera", "doubtful"),
+        (good(motion="rotation"), "pure_rotation", "doubtful"),
+        (good(map=good_map(parallax_deg=0.4)), "low_parallax", "doubtful"),
+        (good(map=good_map(coverage=0.2)), "low_texture", "doubtful"),
+        (good(map=good_map(residual_px=0.6)), "high_residual", "no"),
+        (good(map=good_map(residual_px=float("nan"))), "high_residual", "no"),
+        (good(map=good_map(inlier_ratio=0.85)), "low_inliers", "doubtful"),
+        (good(map=good_map(inlier_ratio=0.4)), "low_inliers", "no"),
+        (good(focal=FocalReport(0.2, observed=False)), "focal_unobservable", "doubtful"),
+        (good(keyframes=np.arange(3, dtype=np.int64)), "few_keyframes", "doubtful"),
+        (good(timestamps_s=np.arange(4) / 30.0), "few_frames", "doubtful"),
+        (good(frame_inlier_ratio=np.zeros(_FRAMES, dtype=np.float32)), "interpolated_frames", "doubtful"),
+    ],
+)
+def test_each_defect_is_named(result: SlamResult, reason: str, reliable: str) -> None:
+    quality = verdict(result)
+    assert reason in quality.reasons
+    assert quality.reliable == reliable
+
+
+def test_the_summary_is_json_ready() -> None:
+    summary = verdict(good(map=good_map(residual_px=float("nan")))).summary()
+    assert summary["residual_px"] is None
+    assert summary["reasons"] == ["high_residual"]
