@@ -9,6 +9,8 @@ from types import TracebackType
 from services.domain.models import ShardPlan, VideoRef, video_key
 from services.planner.listing import Found
 
+_SHARDS_PER_STEP = 8
+
 
 class SeenVideos:
     """Which addresses and keys are taken: a temporary database on disk, so that a million of them need no memory."""
@@ -51,6 +53,15 @@ def new_videos(found: Iterable[Found], seen: SeenVideos) -> Iterator[VideoRef]:
             yield VideoRef(key, video.uri, video.size_bytes, video.etag)
 
 
+def shard_room(ordinal: int, max_videos: int) -> int:
+    """How many videos a shard takes: one at first, one more after every eight shards, `max_videos` in the end.
+
+    So a small job spreads over all slots, a large one shows early what it will be like, and its shards still reach
+    their full size soon.
+    """
+    return min(max_videos, 1 + ordinal // _SHARDS_PER_STEP)
+
+
 def pack(
     videos: Iterable[VideoRef], *, max_videos: int, max_input_bytes: int, first_ordinal: int = 0
 ) -> Iterator[ShardPlan]:
@@ -59,7 +70,8 @@ def pack(
     members: list[VideoRef] = []
     size_bytes = 0
     for video in videos:
-        if members and (len(members) == max_videos or size_bytes + video.size_bytes > max_input_bytes):
+        full = len(members) >= shard_room(ordinal, max_videos)
+        if members and (full or size_bytes + video.size_bytes > max_input_bytes):
             yield ShardPlan(ordinal, tuple(members))
             ordinal += 1
             members, size_bytes = [], 0

@@ -86,7 +86,7 @@ def test_a_job_from_s3_to_s3_survives_kill_9(
     for number in range(4):
         s3.upload_file(str(clip), bucket, f"videos/walk {number}.mp4")
     s3.put_object(Bucket=bucket, Key="videos/sub/broken.mp4", Body=b"\0" * 4096)
-    spec = {"inputs": [f"s3://{bucket}/videos/"], "output": f"s3://{bucket}/run-1", "shard_max_videos": 1}
+    spec = {"inputs": [f"s3://{bucket}/videos/"], "output": f"s3://{bucket}/run-1"}
     job_id = service.client.submit(spec, idempotency_key="once")["id"]
 
     def progress() -> dict[str, Any]:

@@ -18,7 +18,7 @@ from services.domain.models import JobSpec, VideoRef, video_key
 from services.domain.states import JobState
 from services.planner import plan_next
 from services.planner.listing import Found, expand
-from services.planner.packing import SeenVideos, new_videos, pack
+from services.planner.packing import SeenVideos, new_videos, pack, shard_room
 from services.planner.planning import CLAIM_KEY
 from services.store.base import Store
 from services.store.sql import SqlStore
@@ -127,7 +127,7 @@ class TestPacking:
         sizes=st.lists(st.integers(0, 50), max_size=40),
         max_videos=st.integers(1, 7),
         max_bytes=st.integers(1, 60),
-        first=st.integers(0, 5),
+        first=st.integers(0, 60),
     )
     def test_every_video_once_in_order_within_the_limits(
         self, sizes: list[int], max_videos: int, max_bytes: int, first: int
@@ -138,11 +138,19 @@ class TestPacking:
         assert [s.ordinal for s in shards] == list(range(first, first + len(shards)))
         for shard, following in zip(shards, [*shards[1:], None], strict=False):
             total = sum(v.size_bytes for v in shard.videos)
-            assert 1 <= len(shard.videos) <= max_videos
+            room = shard_room(shard.ordinal, max_videos)
+            assert 1 <= len(shard.videos) <= room
             assert total <= max_bytes or len(shard.videos) == 1
             if following is not None:
-                full = len(shard.videos) == max_videos
+                full = len(shard.videos) == room
                 assert full or total + following.videos[0].size_bytes > max_bytes
+
+    def test_small_jobs_spread_and_large_ones_reach_full_shards(self) -> None:
+        refs = [VideoRef(f"v{i}", f"/v{i}", 1) for i in range(1000)]
+        sizes = [len(s.videos) for s in pack(refs, max_videos=4, max_input_bytes=1 << 30)]
+        assert sizes[:8] == [1] * 8
+        assert sizes == sorted(sizes[:-1]) + sizes[-1:]
+        assert set(sizes[24:-1]) == {4}
 
     def test_equal_addresses_are_one_video(self) -> None:
         with SeenVideos() as seen:
@@ -179,7 +187,7 @@ class TestJobs:
         assert plan_next(store)
         assert not plan_next(store)
         uris = [f"{videos}/{i:02d}.mp4" for i in range(5)]
-        assert planned(store, job_id) == [(0, uris[:2]), (1, uris[2:4]), (2, uris[4:])]
+        assert planned(store, job_id) == [(number, [uri]) for number, uri in enumerate(uris)]
         job = store.get_job(job_id)
         assert job.planned
         assert (tmp_path / "out" / CLAIM_KEY).read_text() == f'{{"job_id": "{job_id}", "schema_version": 1}}\n'
@@ -228,8 +236,10 @@ class TestJobs:
         make(videos, "a.mp4")
         assert plan_next(store)
         assert planned(store, job_id) == [
-            (0, [f"{videos}/b.mp4", f"{videos}/c.mp4"]),
-            (1, [f"{videos}/a.mp4", f"{videos}/d.mp4"]),
+            (0, [f"{videos}/b.mp4"]),
+            (1, [f"{videos}/a.mp4"]),
+            (2, [f"{videos}/c.mp4"]),
+            (3, [f"{videos}/d.mp4"]),
         ]
 
     def test_a_missing_input_fails_the_job_and_leaves_the_output_alone(self, store: SqlStore, tmp_path: Path) -> None:
@@ -316,6 +326,6 @@ class TestS3:
     def test_a_job_from_s3_to_s3(self, endpoint: str, bucket: str, store: SqlStore) -> None:
         job_id = submit(store, f"s3://{bucket}/out", f"s3://{bucket}/p/")
         assert plan_next(store, s3_endpoint_url=endpoint)
-        assert [uris for _, uris in planned(store, job_id)] == [["s3://videos/p/a/c.mov", "s3://videos/p/b.mp4"]]
+        assert [uris for _, uris in planned(store, job_id)] == [["s3://videos/p/a/c.mov"], ["s3://videos/p/b.mp4"]]
         claim = boto3.client("s3", endpoint_url=endpoint).get_object(Bucket=bucket, Key=f"out/{CLAIM_KEY}")
         assert job_id.encode() in claim["Body"].read()
