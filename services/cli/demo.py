@@ -41,7 +41,7 @@ def demo(
     _make_room(output)
     samples = _samples(output / "videos", console) if not videos else {}
     inputs = [path.resolve() for path in videos] if videos else list(samples)
-    with _service(output / "service", console) as client:
+    with running_service(output / "service", console) as client:
         job = client.submit(
             {"inputs": [str(path) for path in inputs], "output": str(output / "dataset"), "name": "demo"}
         )
@@ -81,7 +81,7 @@ def _samples(folder: Path, console: Console) -> dict[Path, Path]:
 
 
 @contextlib.contextmanager
-def _service(folder: Path, console: Console) -> Iterator[Client]:
+def running_service(folder: Path, console: Console) -> Iterator[Client]:
     """A service process of its own on a free loopback port; stopped, children included, on the way out."""
     from services.client import Client
 
