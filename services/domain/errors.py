@@ -93,6 +93,14 @@ class ObjectMissing(StorageError):
     retryable = False
 
 
+class StorageRefused(StorageError):
+    """The object store will keep saying no: wrong credentials, no permission, or no such bucket."""
+
+    code = "storage_refused"
+    status = 422
+    retryable = False
+
+
 class StoreUnavailable(ServiceError):
     """The database does not answer, or stayed locked for longer than its patience."""
 

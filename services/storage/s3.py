@@ -18,7 +18,7 @@ from botocore.config import Config
 from botocore.exceptions import BotoCoreError, ClientError, NoCredentialsError, PartialCredentialsError
 from botocore.exceptions import HTTPClientError as TransportError
 
-from services.domain.errors import ObjectMissing, StorageError
+from services.domain.errors import ObjectMissing, StorageError, StorageRefused
 from services.storage.base import ObjectInfo
 from services.storage.keys import TEMPORARY_PREFIX, check_key
 from services.storage.observer import SilentObserver, StorageObserver
@@ -30,6 +30,7 @@ _PART_BYTES = 32 << 20
 _BODY_TRIES = 4  # the client library retries requests, but not a body that breaks off
 _CONFLICT_TRIES = 8
 _ABSENT = {"404", "NoSuchKey", "NotFound"}
+_DENIED = {"403", "AccessDenied", "AllAccessDisabled", "InvalidAccessKeyId", "SignatureDoesNotMatch"}
 _OPERATIONS = {
     "PutObject": "put",
     "CreateMultipartUpload": "put",
@@ -216,7 +217,7 @@ class S3Store:
         except ClientError as error:
             raise _refused(op, where, error) from error
         except (NoCredentialsError, PartialCredentialsError) as error:
-            raise StorageError(f"no credentials for {where}; set AWS_ACCESS_KEY_ID or a profile or a role") from error
+            raise StorageRefused(f"no credentials for {where}; set AWS_ACCESS_KEY_ID or a profile or a role") from error
         except (BotoCoreError, Boto3Error) as error:
             # The transfer manager wraps the client's error; the reason is in the chain.
             if isinstance(error.__context__, ClientError):
@@ -233,7 +234,9 @@ def _refused(op: str, where: str, error: ClientError) -> StorageError:
     if code in _ABSENT:
         return ObjectMissing(f"{where} does not exist")
     if code == "NoSuchBucket":
-        return StorageError(f"the bucket of {where} does not exist; create it or correct the address")
+        return StorageRefused(f"the bucket of {where} does not exist; create it or correct the address")
+    if code in _DENIED:
+        return StorageRefused(f"{op} of {where} is not allowed ({code}); check the credentials and their permissions")
     return StorageError(f"{op} of {where} was refused: {code}")
 
 

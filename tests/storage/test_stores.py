@@ -12,7 +12,7 @@ from typing import ClassVar
 
 import pytest
 
-from services.domain.errors import InvalidRequest, ObjectMissing, StorageError
+from services.domain.errors import InvalidRequest, ObjectMissing, StorageError, StorageRefused
 from services.storage import DirectoryStore, S3Store, open_store
 
 SECRET = "a-secret-that-must-not-leak"
@@ -102,7 +102,7 @@ def test_server_errors_are_retried_then_typed(scripted: tuple[S3Store, type[_Scr
         store.put_bytes("k", b"x")
     assert caught.value.retryable
     server.script[:] = ["403"]
-    with pytest.raises(StorageError, match="head of s3://bucket/k was refused: 403"):
+    with pytest.raises(StorageRefused, match=r"head of s3://bucket/k is not allowed \(403\)"):
         store.head("k")
 
 
@@ -126,7 +126,7 @@ def test_a_missing_bucket_is_not_a_missing_object(s3_endpoint: str, tmp_path: Pa
         lambda: store.put_file("k", tmp_path / "f"),
         lambda: list(store.list()),
     ):
-        with pytest.raises(StorageError, match="bucket of s3://no-such-bucket"):
+        with pytest.raises(StorageRefused, match="bucket of s3://no-such-bucket"):
             use()
 
 
@@ -136,13 +136,13 @@ def test_missing_credentials_say_what_to_set(monkeypatch: pytest.MonkeyPatch, tm
     monkeypatch.setenv("AWS_EC2_METADATA_DISABLED", "true")
     monkeypatch.setenv("AWS_SHARED_CREDENTIALS_FILE", str(tmp_path / "none"))
     monkeypatch.setenv("AWS_CONFIG_FILE", str(tmp_path / "none"))
-    with pytest.raises(StorageError, match="AWS_ACCESS_KEY_ID"):
+    with pytest.raises(StorageRefused, match="AWS_ACCESS_KEY_ID"):
         S3Store("bucket", endpoint_url="http://127.0.0.1:9").head("k")
 
 
 def test_the_endpoint_comes_from_the_environment(monkeypatch: pytest.MonkeyPatch, s3_endpoint: str) -> None:
     monkeypatch.setenv("VIPE_S3_ENDPOINT_URL", s3_endpoint)
-    with pytest.raises(StorageError, match="bucket of s3://nobody-has-this"):
+    with pytest.raises(StorageRefused, match="bucket of s3://nobody-has-this"):
         open_store("s3://nobody-has-this/p").get_bytes("k")
 
 
