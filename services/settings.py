@@ -50,8 +50,8 @@ class Settings(BaseSettings):
     ray_address: str | None = None
     """Address of a Ray cluster to join; None starts a private Ray on this machine."""
 
-    num_slots: int = Field(default=1, ge=1)
-    """Worker processes of the agent, one video in each."""
+    num_slots: int = Field(default_factory=lambda: min(4, os.cpu_count() or 1), ge=1)
+    """Worker processes of the agent, one video in each; default: one per core, 4 at most. On GPUs: as many as GPUs."""
 
     device: Literal["cpu", "cuda"] = "cpu"
     """Where the engine runs."""
@@ -67,6 +67,12 @@ class Settings(BaseSettings):
 
     video_timeout_per_frame_s: float = Field(default=5.0, ge=0)
     """See `video_timeout_base_s`."""
+
+    log_level: str = "INFO"
+    """Least severe messages that are logged."""
+
+    log_format: Literal["text", "json"] = "text"
+    """`json` for a log collector: one object a line."""
 
     @field_validator("data_dir", "scratch_dir")
     @classmethod
