@@ -1,10 +1,11 @@
-"""What the service costs: frames per second through REST, Ray, tars and commits, next to a bare loop over the same videos.
+"""What the service costs: frames per second through REST, Ray, tars and commits, next to a bare loop.
 
     python benchmarks/service_efficiency.py [VIDEO ...] [--slots N]
 
-The bare loop is one warm engine in one process that writes artifacts and nothing else, with as many threads as a slot has.
-The service is timed from the job's start to its last commit (Ray's start and the engine's import are not in it, as they are
-not in the loop's). The ratio is the share of the engine's speed that the service keeps, per slot.
+The bare loop is one warm engine in one process that writes artifacts of the same videos and nothing else, with as many
+threads as a slot has. The service is timed from the job's start to its last commit (Ray's start and the engine's import
+are not in it, as they are not in the loop's). The ratio is the share of the engine's speed that the service keeps, per
+slot.
 """
 
 from __future__ import annotations
