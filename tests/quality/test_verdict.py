@@ -22,7 +22,9 @@ _CELLS = _WORKING.grid.num_cells
 
 def good_map(**changes: float) -> MapReport:
     confidence = np.ones((_KEYFRAMES, _CELLS), dtype=np.float32)
-    report = MapReport(residual_px=0.1, inlier_ratio=0.99, coverage=0.9, parallax_deg=4.0, confidence=confidence)
+    report = MapReport(
+        residual_px=0.1, inlier_ratio=0.99, coverage=0.9, weakest_link=0.6, parallax_deg=4.0, confidence=confidence
+    )
     return replace(report, **changes)  # type: ignore[arg-type]
 
 
@@ -65,6 +67,7 @@ def test_a_good_result_is_reliable_and_its_residual_is_in_source_pixels() -> Non
         (good(map=good_map(residual_px=float("nan"))), "high_residual", "no"),
         (good(map=good_map(inlier_ratio=0.85)), "low_inliers", "doubtful"),
         (good(map=good_map(inlier_ratio=0.4)), "low_inliers", "no"),
+        (good(map=good_map(weakest_link=0.01)), "weak_link", "no"),
         (good(focal=FocalReport(0.2, observed=False)), "focal_unobservable", "doubtful"),
         (good(keyframes=np.arange(3, dtype=np.int64)), "few_keyframes", "doubtful"),
         (good(timestamps_s=np.arange(4) / 30.0), "few_frames", "doubtful"),

@@ -11,6 +11,7 @@ Reason codes are stable: they are stored with every video.
     focal_unobservable  the focal length is the initial guess, or no better than one
     high_residual       the measurements that fit, fit badly
     low_inliers         much of the picture contradicts the camera motion (moving objects, or a wrong solution)
+    weak_link           two parts of the clip hang together by almost nothing: a cut, a blur, a jump
     interpolated_frames frames whose own pose fit failed
 """
 
@@ -25,8 +26,9 @@ _MIN_KEYFRAMES = 5
 _LOW_PARALLAX_DEG = 1.0
 _LOW_COVERAGE = 0.35
 _HIGH_RESIDUAL_RATIO = 0.8 / 640
-_LOW_INLIERS = 0.93
+_LOW_INLIERS = 0.9
 _VERY_LOW_INLIERS = 0.6
+_WEAK_LINK = 0.08
 _POSED_INLIERS = 0.1
 _MAX_INTERPOLATED = 0.02
 
@@ -60,6 +62,9 @@ def assess(result: SlamResult, settings: SlamSettings, source_width: int) -> Qua
         if found.inlier_ratio < _LOW_INLIERS:
             reasons.append("low_inliers")
             fatal = fatal or found.inlier_ratio < _VERY_LOW_INLIERS
+        if found.weakest_link < _WEAK_LINK:
+            reasons.append("weak_link")
+            fatal = True
         if float((result.frame_inlier_ratio < _POSED_INLIERS).mean()) > _MAX_INTERPOLATED:
             reasons.append("interpolated_frames")
     if result.focal.sigma_ratio > settings.focal_doubt_sigma:

@@ -31,7 +31,7 @@ POSE_ONLY = (Step("huber", 1.0, 8), Step("geman_mcclure", 2.0, 8), Step("geman_m
 
 _MAX_SEEDS = 3
 _MIN_POINTS = 50
-_MIN_WEIGHT = 0.3
+_MIN_WEIGHT = 0.1
 _MAX_POINTS = 600
 _DEPTH_SPREAD = 20.0
 # Two starts that end this close have found the same minimum: no need to try more.

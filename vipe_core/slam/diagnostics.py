@@ -25,8 +25,11 @@ class MapReport:
 
     Attributes:
         residual_px: Median residual of inliers, working pixels; NaN without measurements.
-        inlier_ratio: Share of the measurements' weight within the robust scale; 0 without measurements.
+        inlier_ratio: Share of the measurements' weight within the robust scale, moving cells included: masking what
+            does not fit would make any answer look right. 0 without measurements.
         coverage: Share of keyframe cells that at least one edge measures.
+        weakest_link: The clip falls apart in two at each step between keyframes but for the edges across it: share of
+            cells that fit on the best of those edges, at the worst step. 1 with a single keyframe.
         parallax_deg: Median over keyframes of the median angle between the rays of a point, over its widest edge.
         confidence: (K, P) float32 in 0..1: 0.5 where the inverse depth is determined to 10 % given the poses.
     """
@@ -34,6 +37,7 @@ class MapReport:
     residual_px: float
     inlier_ratio: float
     coverage: float
+    weakest_link: float
     parallax_deg: float
     confidence: NDArray[np.float32]
 
@@ -44,6 +48,7 @@ def examine(reprojector: Reprojector, keyframes: KeyframeMap, graph: Graph, robu
     information = np.zeros((count, cells), dtype=np.float64)
     covered = np.zeros((count, cells), dtype=np.bool_)
     parallax = np.zeros(count)
+    link = np.zeros(max(count - 1, 0))
     inside = total = 0.0
     errors: list[Array] = []
     for i, j in graph:
@@ -51,7 +56,7 @@ def examine(reprojector: Reprojector, keyframes: KeyframeMap, graph: Graph, robu
         relative = relative_pose(keyframes.pose(j), keyframes.pose(i))
         depth = keyframes.depth(i)
         induced = reprojector.induced(keyframes.intrinsics, relative, depth)
-        weight = match.weight.mean(axis=1) * keyframes.static(i)
+        weight = match.weight.mean(axis=1)
         use = (weight > _MIN_WEIGHT) & np.isfinite(induced.target_px).all(axis=1)
         if not use.any():
             continue
@@ -60,6 +65,8 @@ def examine(reprojector: Reprojector, keyframes: KeyframeMap, graph: Graph, robu
         total += float(weight[use].sum())
         inside += float(weight[inlier].sum())
         errors.append(error[inlier])
+        first, last = min(i, j), max(i, j)
+        link[first:last] = np.maximum(link[first:last], float(inlier.mean()))
         covered[i] |= inlier
         # Change of the projection with log depth: what this edge knows about the cell's depth.
         moved = reprojector.induced(keyframes.intrinsics, relative, depth * np.exp(_LOG_STEP))
@@ -75,6 +82,7 @@ def examine(reprojector: Reprojector, keyframes: KeyframeMap, graph: Graph, robu
         residual_px=float(np.median(residuals)) if len(residuals) else float("nan"),
         inlier_ratio=inside / total if total > 0 else 0.0,
         coverage=float(covered.mean()) if count else 0.0,
+        weakest_link=float(link.min()) if len(link) else 1.0,
         parallax_deg=float(np.median(parallax)) if count else 0.0,
         confidence=np.where(information > 0, confidence, 0.0).astype(np.float32),
     )
