@@ -23,6 +23,7 @@ class ClipSource:
     def __init__(self, rgb: np.ndarray) -> None:
         self.rgb = rgb
         self.open = 0
+        self.decoded = 0
 
     @property
     def info(self) -> VideoInfo:
@@ -33,6 +34,7 @@ class ClipSource:
         self.open += 1
         try:
             for index, rgb in list(enumerate(self.rgb))[start:stop]:
+                self.decoded += size is not None
                 picture = rgb if size is None else cv2.resize(rgb, size, interpolation=cv2.INTER_AREA)
                 yield Frame(index, index / 24, picture)
         finally:
@@ -159,6 +161,13 @@ def test_closing_early_closes_the_decoders(sideways: SyntheticClip) -> None:
     assert source.open == 2
     stream.close()
     assert source.open == 0
+
+
+def test_the_decoder_ahead_stays_within_the_window(sideways: SyntheticClip) -> None:
+    settings = DepthSettings(window_frames=3, check_frames=(2,))
+    source = ClipSource(sideways.rgb)
+    for frame in DenseDepth(settings).stream(source, scene_of(sideways)):
+        assert source.decoded <= frame.index + 3 + 2 + 1
 
 
 def test_a_video_that_ends_early_is_an_engine_error(sideways: SyntheticClip) -> None:

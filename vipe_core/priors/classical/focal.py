@@ -31,6 +31,12 @@ _STILL_GROWING = 1.15
 _FULL_CONSISTENCY = 0.5
 _MIN_TOTAL_WEIGHT = 0.05
 _MIN_LOG_SIGMA = 0.03
+# Rotation on the spot: a homography must explain this share of the pair, be a rotation up to this share of its angle,
+# and so many pairs must say so. Their sigma is wider: a plane seen in motion can pass for a rotation.
+_ALL_FLAT = 0.85
+_MAX_ROTATION_MISFIT = 0.15
+_MIN_ROTATIONS = 3
+_MIN_ROTATION_LOG_SIGMA = 0.08
 _MIN_FOCAL_RATIO, _MAX_FOCAL_RATIO = 0.2, 4.0
 
 
@@ -43,6 +49,7 @@ class FocalVote:
         focal_px: Focal length at the working resolution.
         weight: Inlier ratio x (1 - homography inlier ratio), less where little is matched, 0..1.
         motion_px: Median displacement between the frames.
+        rotation_focal_px: Focal length from the homography where one explains the pair and is a rotation, else NaN.
     """
 
     source: int
@@ -50,6 +57,7 @@ class FocalVote:
     focal_px: float
     weight: float
     motion_px: float
+    rotation_focal_px: float = math.nan
 
 
 class TwoViewFocalInit:
@@ -93,8 +101,7 @@ class TwoViewFocalInit:
         height, width = frames[0].gray.shape
         votes = self.votes(frames)
         default_focal = width / 2 / math.tan(math.radians(self._default_fov_deg) / 2)
-        focal, sigma = _combine(votes, default_focal, self._default_log_sigma)
-        used = sum(v.weight > 0 for v in votes)
+        focal, sigma, used = _combine(votes, default_focal, self._default_log_sigma)
         logger.debug("focal %.1f px, sigma %.3f from %d pairs", focal, sigma, used)
         camera = Camera("pinhole", (focal, focal, width / 2, height / 2), width, height)
         return IntrinsicsEstimate(camera, sigma, used)
@@ -173,12 +180,16 @@ class TwoViewFocalInit:
         }
         pp = np.array([(width - 1) / 2, (height - 1) / 2])
         pair, report = poselib.estimate_shared_focal_relative_pose(first, second, pp, ransac, {})
-        _, flat = poselib.estimate_homography(first, second, ransac, {})
+        homography, flat = poselib.estimate_homography(first, second, ransac, {})
         focal = float(pair.camera1.focal())
         inliers, flat_inliers = float(report["inlier_ratio"]), float(flat["inlier_ratio"])
         if not math.isfinite(focal) or not _MIN_FOCAL_RATIO * width < focal < _MAX_FOCAL_RATIO * width:
             return None
-        return FocalVote(source_at, target_at, focal, inliers * max(0.0, 1 - flat_inliers) * trust, motion)
+        turned = math.nan
+        if flat_inliers * trust > _ALL_FLAT:
+            turned = _rotation_focal(np.asarray(homography, np.float64), pp, width)
+        weight = inliers * max(0.0, 1 - flat_inliers) * trust
+        return FocalVote(source_at, target_at, focal, weight, motion, turned)
 
     def _correspondences(
         self, source: FlowFeatures, target: FlowFeatures
@@ -202,24 +213,58 @@ class TwoViewFocalInit:
         return centres.astype(np.float64), forward.target_px[kept].astype(np.float64), forward.consistent
 
 
-def _combine(votes: Sequence[FocalVote], default_focal: float, default_sigma: float) -> tuple[float, float]:
-    """Weighted median of log(f), and an honest sigma, both blended with the default as two Gaussians.
+def _combine(votes: Sequence[FocalVote], default_focal: float, default_sigma: float) -> tuple[float, float, int]:
+    """Weighted median of log(f), an honest sigma, and the number of votes behind them.
 
+    The vote is blended with the default as two Gaussians. Without parallax, rotations vote in place of the pairs.
     Pairs that contradict each other (forward driving, moving objects) thereby fall back to the default smoothly.
     """
     weights = np.array([v.weight for v in votes])
-    if not len(votes) or weights.sum() < _MIN_TOTAL_WEIGHT:
-        return default_focal, default_sigma
-    log_focal, weights = _sorted(np.log([v.focal_px for v in votes]), weights)
+    turned = np.array([v.rotation_focal_px for v in votes])
+    turned = turned[np.isfinite(turned)]
+    if weights.sum() >= _MIN_TOTAL_WEIGHT * max(1, len(weights)):
+        log_focal, weights = _sorted(np.log([v.focal_px for v in votes]), weights)
+        floor = _MIN_LOG_SIGMA
+    elif len(turned) >= _MIN_ROTATIONS:
+        log_focal, weights = np.sort(np.log(turned)), np.full(len(turned), 0.5)
+        floor = _MIN_ROTATION_LOG_SIGMA
+    else:
+        return default_focal, default_sigma, 0
     median = _weighted_quantile(log_focal, weights, 0.5)
     spread = 1.4826 * _weighted_quantile(*_sorted(np.abs(log_focal - median), weights), 0.5)
     # Pairs share their errors (same scene, same kind of motion), so the spread is not divided by their number; with
     # few or light pairs the spread itself is uncertain.
-    sigma = max(_MIN_LOG_SIGMA, spread) * math.sqrt(1 + 1 / float(weights.sum()))
+    sigma = max(floor, spread) * math.sqrt(1 + 1 / float(weights.sum()))
     information, default_information = 1 / sigma**2, 1 / default_sigma**2
     total = information + default_information
     mean = (information * median + default_information * math.log(default_focal)) / total
-    return math.exp(mean), 1 / math.sqrt(total)
+    return math.exp(mean), 1 / math.sqrt(total), len(log_focal)
+
+
+def _rotation_focal(homography: NDArray[np.float64], pp: NDArray[np.float64], width: int) -> float:
+    """The focal length for which K^-1 H K is a rotation; NaN if there is none.
+
+    H = K R K^-1 holds for a camera that turns on the spot (Hartley, ECCV 1994). The search is over a grid of log(f)
+    with a parabola at the minimum of the distance from orthogonality.
+    """
+    centred = np.array([[1, 0, -pp[0]], [0, 1, -pp[1]], [0, 0, 1]]) @ homography
+    centred = centred @ np.array([[1, 0, pp[0]], [0, 1, pp[1]], [0, 0, 1]])
+    determinant = float(np.linalg.det(centred))
+    if not abs(determinant) > 1e-12:
+        return math.nan
+    centred /= math.cbrt(determinant)  # a homography is given up to sign and scale
+    logs = np.log(width) + np.linspace(math.log(_MIN_FOCAL_RATIO), math.log(_MAX_FOCAL_RATIO), 200)
+    focal = np.exp(logs)
+    scale = np.stack([focal, focal, np.ones_like(focal)], axis=-1)
+    rotations = centred * scale[:, None, :] / scale[:, :, None]
+    misfit = np.linalg.norm(rotations @ rotations.transpose(0, 2, 1) - np.eye(3), axis=(1, 2)) / 2
+    best = int(misfit.argmin())
+    angle = float(np.linalg.norm(rotations[best] - np.eye(3))) / math.sqrt(2)
+    if best in (0, len(logs) - 1) or misfit[best] > _MAX_ROTATION_MISFIT * angle:
+        return math.nan
+    before, here, after = np.square(misfit[best - 1 : best + 2])
+    shift = 0.5 * (before - after) / (before - 2 * here + after)
+    return float(math.exp(logs[best] + float(np.clip(shift, -0.5, 0.5)) * (logs[1] - logs[0])))
 
 
 def _sorted(
