@@ -34,6 +34,7 @@ class SlotState(StrEnum):
     IDLE = "idle"
     BUSY = "busy"
     FENCED = "fenced"
+    LOST = "lost"  # no process starts any more
 
 
 class Agent:
@@ -61,6 +62,8 @@ class Agent:
         self._states: dict[int, SlotState] = {}
         self._claims = Backoff(config.backoff_base_s, config.backoff_max_s)
         self._claim_after_s = 0.0
+        self._recoveries = self._new_backoff()
+        self._recover_after_s = 0.0
         self._thread: threading.Thread | None = None
 
     @property
@@ -135,10 +138,28 @@ class Agent:
                 return True
         return False
 
+    def _recover_executor(self) -> None:
+        """Start the executor anew when not one slot gets a process: then it is not the slots."""
+        with self._lock:
+            states = set(self._states.values())
+        if states != {SlotState.LOST} or time.monotonic() < self._recover_after_s:
+            return
+        logger.error("no worker process starts in any slot: the executor is started anew")
+        self._recover_after_s = time.monotonic() + self._config.start_timeout_s + self._recoveries.failed()
+        try:
+            self._executor.restart()
+        except Exception as error:
+            logger.exception("the executor did not start: %s", error)
+            return
+        with self._lock:
+            self._states = dict.fromkeys(self._states, SlotState.STARTING)
+        self._publish_slots()
+
     def _claim_until_stopped(self) -> None:
         next_expiry_s = next_counts_s = 0.0
         while not self._stopping.is_set():
             now = time.monotonic()
+            self._recover_executor()
             try:
                 if now >= next_expiry_s:
                     next_expiry_s = now + self._config.lease_ttl_s / 3
@@ -186,7 +207,7 @@ class Agent:
         backoff = self._new_backoff()
         while not self._stopping.is_set():
             if not supervisor.start():
-                self._enter(number, SlotState.FENCED if backoff.failures >= 2 else SlotState.STARTING)
+                self._enter(number, SlotState.LOST if backoff.failures else SlotState.STARTING)
                 self._stopping.wait(backoff.failed())
                 continue
             backoff.succeeded()

@@ -48,10 +48,13 @@ class SlotHandle(Protocol):
 
 
 class Executor(Protocol):
-    """Owns the processes of an agent."""
+    """Owns the processes of an agent. All methods from one thread, which must live as long as the executor."""
 
     def start(self) -> None:
-        """Start or join the machinery. Called once, from the thread that will call `stop`."""
+        """Start or join the machinery."""
+
+    def restart(self) -> None:
+        """Start the machinery anew after it was lost. Handles stay valid; their processes are gone."""
 
     def slots(self) -> list[SlotHandle]:
         """One handle per slot, not started yet."""

@@ -21,7 +21,7 @@ import signal
 import tempfile
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -46,7 +46,7 @@ _THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS
 _PRIVATE_ENVIRONMENT = {
     "RAY_USAGE_STATS_ENABLED": "0",
     "RAY_DISABLE_FAILURE_SIGNAL_HANDLER": "1",
-    "RAY_gcs_rpc_server_reconnect_timeout_s": "10",
+    "RAY_gcs_rpc_server_reconnect_timeout_s": "30",
     "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0",
 }
 
@@ -78,7 +78,7 @@ class SlotActor:
 class RaySlot:
     """A `SlotHandle` on a Ray actor."""
 
-    def __init__(self, actor_class: Any, config: AgentConfig, *, private: bool) -> None:
+    def __init__(self, actor_class: Callable[[], Any], config: AgentConfig, *, private: bool) -> None:
         self._actor_class = actor_class
         self._config = config
         self._private = private
@@ -111,7 +111,7 @@ class RaySlot:
         )
         level = logging.getLevelName(logging.getLogger().getEffectiveLevel())
         try:
-            self._actor = self._actor_class.options(**options).remote(slot_config, level)
+            self._actor = self._actor_class().options(**options).remote(slot_config, level)
             self._node_id, self._pid = ray.get(self._actor.identity.remote(), timeout=timeout_s)
         except RayError as error:
             return _died(error)
@@ -122,6 +122,8 @@ class RaySlot:
     def submit(self, task: Task) -> None:
         if self._actor is None or self._task is not None:
             raise RuntimeError("a slot takes one task at a time, and only while its process lives")
+        with self._lock:  # What is known is about the task before this one.
+            self._progress, self._progress_call = SlotProgress(), None
         self._task = self._actor.run.remote(task)
 
     def poll(self, timeout_s: float) -> Reply | Died | None:
@@ -193,6 +195,7 @@ class RayExecutor:
         self._config = config
         self._private = config.ray_address is None
         self._temp_dir: Path | None = None
+        self._actor_class: Any = None
         self._slots: list[RaySlot] = []
 
     def start(self) -> None:
@@ -201,6 +204,24 @@ class RayExecutor:
         Raises:
             ConnectionError: The cluster does not answer.
         """
+        self._connect()
+        self._slots = [
+            RaySlot(lambda: self._actor_class, self._config, private=self._private) for _ in range(self._config.slots)
+        ]
+
+    def restart(self) -> None:
+        """Leave a Ray that does not answer and start or join again. Raises what `start` raises."""
+        self._disconnect()
+        self._connect()
+
+    def slots(self) -> list[SlotHandle]:
+        return list(self._slots)
+
+    def stop(self) -> None:
+        self._disconnect()
+        self._slots = []
+
+    def _connect(self) -> None:
         started = time.monotonic()
         if self._private:
             self._start_private()
@@ -213,19 +234,14 @@ class RayExecutor:
                 log_to_driver=False,
                 configure_logging=False,
             )
-        actor_class = self._actor_class()
-        self._slots = [RaySlot(actor_class, self._config, private=self._private) for _ in range(self._config.slots)]
+        self._actor_class = self._new_actor_class()
         logger.info("Ray is ready after %.1f s", time.monotonic() - started)
 
-    def slots(self) -> list[SlotHandle]:
-        return list(self._slots)
-
-    def stop(self) -> None:
+    def _disconnect(self) -> None:
         import ray
 
         for slot in self._slots:
             slot.kill()
-        self._slots = []
         ray.shutdown()
         if self._temp_dir is not None:
             shutil.rmtree(self._temp_dir, ignore_errors=True)
@@ -260,7 +276,7 @@ class RayExecutor:
         threads = str(self._config.cpus_per_slot)
         return {**dict.fromkeys(_THREAD_VARIABLES, threads), "OMP_WAIT_POLICY": "passive"}
 
-    def _actor_class(self) -> Any:
+    def _new_actor_class(self) -> Any:
         import ray
 
         config = self._config

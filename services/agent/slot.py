@@ -113,7 +113,9 @@ class Slot:
         except ObjectMissing as error:
             return Failed(InputUnavailable.code if scope == "video" else error.code, str(error), False, scope)
         except StorageError as error:
-            return Failed(error.code, str(error), retryable=True, scope="storage")
+            # An output that refuses fails the job in the end; an input that refuses becomes a row in the end.
+            refused_output = scope == "shard" and not error.retryable
+            return Failed(error.code, str(error), error.retryable, "shard" if refused_output else "storage")
         except (ServiceError, VipeError) as error:
             return Failed(error.code, str(error), error.retryable, scope)
         except OSError as error:

@@ -170,6 +170,7 @@ class Supervisor:
         pack_deaths = 0
         while True:
             self._annotate_all(live, results, deaths)
+            live.follow(tuple(results.values()), self._handle.progress)
             ordered = tuple(results[video.key] for video in lease.videos)
             answer = self._run(live, PackShard(lease, ordered), lambda: self._config.pack_budget_s)
             match answer:
@@ -219,7 +220,7 @@ class Supervisor:
                     case Failed(scope="storage"):
                         self._suspicious.clear()
                         delay_s = storage.failed()
-                        if storage.failures < self._config.storage_tries:
+                        if answer.retryable and storage.failures < self._config.storage_tries:
                             logger.warning("storage failed, next try in %.1f s: %s", delay_s, answer.message)
                             self._pause(live, delay_s)
                         elif self._give_backs.exhausted(lease.shard_id):
@@ -324,7 +325,7 @@ class Supervisor:
         while not self.start():
             delay_s = backoff.failed()
             if backoff.failures >= self._config.max_slot_deaths:
-                raise _Ended(ShardOutcome("given_back", "slot_fenced", "no worker process starts", fenced=True))
+                raise _Ended(ShardOutcome("given_back", "no_worker", "no worker process starts"))
             self._pause(live, delay_s)
 
     def _budget_s(self, video: VideoRef) -> float:

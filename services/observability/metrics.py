@@ -101,7 +101,7 @@ class Metrics:
         )
         self.actors = Gauge(
             "vipe_actors",
-            "Worker slots by role and state: starting, idle, busy, fenced.",
+            "Worker slots by role and state: starting, idle, busy, fenced, lost.",
             ["role", "state"],
             registry=registry,
         )

@@ -31,13 +31,16 @@ from services.store.sql import SqlStore
 class ThreadSlot:
     """A `SlotHandle` whose process is a thread with the real worker code."""
 
-    def __init__(self, config: AgentConfig) -> None:
+    def __init__(self, config: AgentConfig, executor: ThreadExecutor) -> None:
+        self._executor = executor
         self._config = SlotConfig(config.scratch_dir, "cpu", config.engine, None, 1e9)
         self._slot = Slot(self._config)
         self._replies: list[Reply] = []
         self._done = threading.Event()
 
     def start(self, timeout_s: float) -> Died | None:
+        if self._executor.lost:
+            return Died("there is nothing that could start it")
         self._slot = Slot(self._config)
         return None
 
@@ -68,6 +71,8 @@ class ThreadExecutor:
     def __init__(self, config: AgentConfig) -> None:
         self._config = config
         self.failures = 0
+        self.restarts = 0
+        self.lost = False
         self.stopped = False
 
     def start(self) -> None:
@@ -75,8 +80,12 @@ class ThreadExecutor:
             self.failures -= 1
             raise ConnectionError("no cluster yet")
 
+    def restart(self) -> None:
+        self.restarts += 1
+        self.lost = False
+
     def slots(self) -> list[SlotHandle]:
-        return [ThreadSlot(self._config) for _ in range(self._config.slots)]
+        return [ThreadSlot(self._config, self) for _ in range(self._config.slots)]
 
     def stop(self) -> None:
         self.stopped = True
@@ -219,6 +228,14 @@ def test_an_executor_that_starts_late_and_a_store_that_stumbles_are_waited_for(
     monkeypatch.setattr(world.store, "claim", stumbling)
     world.agent.start()
     assert world.ended(job_id) is JobState.SUCCEEDED
+
+
+def test_machinery_that_is_lost_is_started_anew(world: World) -> None:
+    world.executor.lost = True
+    job_id = world.submit("job", {"a": "frames=3"})
+    world.agent.start()
+    assert world.ended(job_id) is JobState.SUCCEEDED
+    assert world.executor.restarts == 1
 
 
 def test_an_index_that_cannot_be_written_yet_is_written_later(world: World, monkeypatch: pytest.MonkeyPatch) -> None:

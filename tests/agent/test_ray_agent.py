@@ -21,7 +21,7 @@ from services.agent.executor import Died
 from services.agent.messages import Annotated, AnnotateVideo, Cancelled, Opened, OpenShard, Reply
 from services.agent.ray_executor import RayExecutor, RaySlot
 from services.commit.reconcile import committed_records
-from services.domain.models import Job, JobSpec, VideoResult
+from services.domain.models import Job, JobSpec, ShardPlan, VideoRef, VideoResult, video_key
 from services.domain.states import JobState, VideoStatus
 from services.observability.metrics import Metrics
 from services.storage import open_store
@@ -49,18 +49,23 @@ def _wait(condition: Callable[[], bool], what: str, seconds: float = 90.0) -> No
         time.sleep(0.1)
 
 
-def _submit(store: SqlStore, root: Path, scripts: dict[str, str], *, shard_max_videos: int = 16) -> str:
+def _submit(store: SqlStore, root: Path, *shards: dict[str, str]) -> str:
+    """A planned job with these shards."""
     inputs = root / "inputs"
     inputs.mkdir()
-    for name, script in scripts.items():
-        (inputs / f"{name}.mp4").write_text(script)
-    spec = JobSpec(
-        (str(inputs),),
-        str(root / "out"),
-        attributes=("pose", "intrinsics", "depth"),
-        shard_max_videos=shard_max_videos,
-    )
-    return store.create_job(spec)[0].id
+    job_id = store.create_job(JobSpec((str(inputs),), str(root / "out"), attributes=("pose", "intrinsics", "depth")))[
+        0
+    ].id
+    assert store.begin_planning(job_id)
+    for ordinal, scripts in enumerate(shards):
+        videos = []
+        for name, script in scripts.items():
+            path = inputs / f"{name}.mp4"
+            path.write_text(script)
+            videos.append(VideoRef(video_key(str(path)), str(path), len(script)))
+        store.add_shards(job_id, [ShardPlan(ordinal, tuple(videos))])
+    store.finish_planning(job_id)
+    return job_id
 
 
 def _finished(store: SqlStore, job_id: str, seconds: float = 120.0) -> Job:
@@ -200,8 +205,9 @@ def test_deaths_and_poison_leave_the_others_unharmed(tmp_path: Path) -> None:
 def test_kill_9_of_the_agent_loses_and_doubles_nothing(tmp_path: Path) -> None:
     store = SqlStore(f"sqlite:///{tmp_path}/vipe.db")
     count = tmp_path / "count"
-    scripts = {f"v{number}": f"frames=3 slow=0.5 count={count}" for number in range(8)}
-    job_id = _submit(store, tmp_path, scripts, shard_max_videos=4)
+    names = [f"v{number}" for number in range(8)]
+    scripts = dict.fromkeys(names, f"frames=3 slow=0.5 count={count}")
+    job_id = _submit(store, tmp_path, {n: scripts[n] for n in names[:4]}, {n: scripts[n] for n in names[4:]})
     environment = {**os.environ, "VIPE_TEST_ROOT": str(tmp_path)}
 
     def run() -> subprocess.Popen[bytes]:
@@ -230,8 +236,8 @@ def test_kill_9_of_the_agent_loses_and_doubles_nothing(tmp_path: Path) -> None:
     tried = Counter(line.rsplit("-", 1)[0] for line in count.read_text().split())
     # What was committed or finished is not done again; at most the video that was running at the kill is.
     assert set(tried) == set(scripts)
-    assert all(tried[f"v{number}"] == 1 for number in range(4))
-    assert sum(tried.values()) <= len(scripts) + 1
+    assert all(tried[name] == 1 for name in names[:4])
+    assert sum(tried.values()) <= len(names) + 1
     store.close()
 
 

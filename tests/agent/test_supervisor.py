@@ -9,8 +9,9 @@ from agent_rig import Rig
 
 from services.agent.leases import StopReason
 from services.agent.messages import AnnotateVideo, PackShard
-from services.domain.errors import StorageError
+from services.domain.errors import StorageError, StorageRefused
 from services.domain.states import JobState, ShardState, VideoStatus
+from services.storage import open_store
 
 
 @pytest.fixture
@@ -228,50 +229,60 @@ def test_unreachable_output_gives_the_lease_back_and_then_goes_on(rig: Rig, monk
     assert rig.slot.annotated() == ["a"]  # The artifacts were still there.
 
 
-def test_an_input_that_can_never_be_fetched_becomes_a_row_in_the_end(tmp_path: Path) -> None:
+@pytest.mark.parametrize("error", [StorageError, StorageRefused])
+def test_an_input_that_can_never_be_fetched_becomes_a_row_in_the_end(
+    tmp_path: Path, error: type[StorageError], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def unreachable(uri: str, **options: object) -> object:
+        if uri.startswith("s3://"):
+            raise error(f"{uri} is out of reach")
+        return open_store(uri, **options)  # type: ignore[arg-type]
+
+    monkeypatch.setattr("services.agent.slot.open_store", unreachable)
     rig = Rig.make(tmp_path, max_give_backs=2, storage_tries=2)
     rig.job({"a": "frames=3"})
-    # A directory in the way of scratch makes every fetch fail the way a full disk does.
     outcomes = []
     for _ in range(3):
         live = rig.lease()
         object.__setattr__(live.lease.videos[0], "uri", "s3://bucket/a.mp4")
-        monkey = pytest.MonkeyPatch()
-        monkey.setattr("services.agent.slot.open_store", _unreachable)
-        outcomes.append(_work_with_local_output(rig, live, monkey))
+        outcomes.append(rig.supervisor.work(live).kind)
     assert outcomes == ["given_back", "given_back", "committed"]
-    assert next(iter(rig.rows(live).values())).error_code == "input_unavailable"
+    (row,) = rig.rows(live).values()
+    assert (row.status, row.error_code) == (VideoStatus.FAILED, "input_unavailable")
 
 
-def _work_with_local_output(rig: Rig, live: object, monkey: pytest.MonkeyPatch) -> str:
-    try:
-        return rig.supervisor.work(live).kind  # type: ignore[arg-type]
-    finally:
-        monkey.undo()
+def test_an_output_that_refuses_fails_the_job_in_the_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refusing(uri: str, **options: object) -> object:
+        raise StorageRefused(f"{uri} may not be written")
+
+    monkeypatch.setattr("services.agent.slot.open_store", refusing)
+    rig = Rig.make(tmp_path, max_give_backs=2)
+    job_id = rig.job({"a": "frames=3"})
+    assert [rig.supervisor.work(rig.lease()).kind for _ in range(3)] == ["given_back", "given_back", "job_failed"]
+    job = rig.store.get_job(job_id)
+    assert (job.state, job.error_code) == (JobState.FAILED, "storage_refused")
+    assert rig.slot.annotated() == ["a"]
 
 
-def _unreachable(uri: str, **options: object) -> object:
-    from services.storage import open_store
-
-    if uri.startswith("s3://"):
-        raise StorageError(f"{uri} does not answer")
-    return open_store(uri, **options)  # type: ignore[arg-type]
-
-
-def test_no_worker_process_at_all_fences_the_slot(rig: Rig) -> None:
+def test_without_a_worker_process_the_lease_is_given_back(rig: Rig) -> None:
     rig.job({"a": "frames=3"})
     live = rig.lease()
     rig.slot.start_failures = 3
     outcome = rig.supervisor.work(live)
-    assert (outcome.kind, outcome.fenced) == ("given_back", True)
+    assert (outcome.kind, outcome.reason) == ("given_back", "no_worker")
     assert rig.metric("vipe_actor_restarts_total", reason="start_failed") == 3
     assert rig.supervisor.work(rig.lease()).kind == "committed"
 
 
 def test_progress_counts_finished_videos_and_expects_the_rest_to_be_alike(rig: Rig) -> None:
-    rig.job({"a": "frames=4", "b": "frames=8", "c": "hang"})
+    rig.job({"a": "frames=4", "b": "frames=8", "c": "frames=9"})
     live = rig.lease()
     reports = []
-    rig.slot.before_poll = [None, None, None, lambda: reports.append(live.report())]
+
+    def look() -> None:
+        report = live.report()
+        reports.append((report.videos_done, report.frames_done, report.frames_expected))
+
+    rig.slot.before_poll = [look] * 5  # open, a, b, c, pack
     rig.supervisor.work(live)
-    assert (reports[0].videos_done, reports[0].frames_done, reports[0].frames_expected) == (2, 12, 18)
+    assert reports == [(0, 0, None), (0, 0, None), (1, 4, 12), (2, 12, 18), (3, 21, 21)]
