@@ -7,7 +7,7 @@ that confirm them.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from contextlib import closing
 from typing import Any
 
@@ -42,7 +42,7 @@ class DenseDepth:
     def __init__(self, settings: DepthSettings | None = None) -> None:
         self._settings = settings or DepthSettings()
 
-    def stream(self, source: FrameSource, scene: SceneMap) -> Iterator[DepthFrame]:
+    def stream(self, source: FrameSource, scene: SceneMap) -> Generator[DepthFrame, None, None]:
         """Depth of every frame of the video, in order; closing the iterator stops the decoders.
 
         Frames without parallax (a static camera, pure rotation) get the keyframes' inverse depth carried into them and
@@ -52,9 +52,6 @@ class DenseDepth:
             InputError, DecodeError: From the source.
             EngineError: The video has fewer frames than there are poses.
         """
-        return self._stream(source, scene)
-
-    def _stream(self, source: FrameSource, scene: SceneMap) -> Iterator[DepthFrame]:
         settings = self._settings
         num_frames = len(scene.world_from_cam)
         size = (scene.camera.width, scene.camera.height)
