@@ -38,6 +38,7 @@ _OBJECT_STORE_BYTES = 100 << 20  # Results are a few kilobytes; frames never tra
 _SESSION_PATH_CHARS = 66  # "/session_<date>_<time>_<pid>/sockets/plasma_store" and what Ray appends
 _MAX_SOCKET_PATH = 107
 _PROGRESS_INTERVAL_S = 0.5
+_KILL_PATIENCE_S = 2.0
 _NAMESPACE = "vipe"
 _THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
 
@@ -183,9 +184,8 @@ class RaySlot:
             return
         with contextlib.suppress(Exception):  # Ray itself may be gone; then so is the actor.
             ray.kill(actor, no_restart=True)
-        if self._private and pid is not None:  # Does not wait for a worker that hangs with its lock held.
-            with contextlib.suppress(ProcessLookupError):
-                os.kill(pid, signal.SIGKILL)
+        if self._private and pid is not None:
+            _ensure_gone(pid)
 
 
 class RayExecutor:
@@ -322,6 +322,17 @@ def private_temp_dir(preferred: Path) -> Path:
             shutil.rmtree(old, ignore_errors=True)
     chosen.mkdir(parents=True, exist_ok=True, mode=0o700)
     return chosen
+
+
+def _ensure_gone(pid: int) -> None:
+    """Wait a moment for Ray to end a process of this machine; one that hangs gets the signal that cannot be ignored."""
+    deadline = time.monotonic() + _KILL_PATIENCE_S
+    while Path(f"/proc/{pid}").exists():
+        if time.monotonic() > deadline:
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(pid, signal.SIGKILL)
+            return
+        time.sleep(0.02)
 
 
 def _died(error: Exception) -> Died:
