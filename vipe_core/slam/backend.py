@@ -64,6 +64,11 @@ class Backend:
         if len(self._keyframes) < 2:
             return None
         self._connect_loops()
+        self._mask_moving()
+        if self._measured.graph.area_votes:
+            # With large things moving, a free focal length helps them before they are masked.
+            self._adjust_everything(free_focal=False)
+            self._mask_moving()
         result = self._adjust()
         if self._mask_moving():
             result = self._adjust() or result
@@ -88,9 +93,8 @@ class Backend:
 
     def _adjust(self) -> Result | None:
         """Adjust with a free focal length under its prior; take it back when it runs out of any lens's range."""
-        frames = range(len(self._keyframes))
         before = self._keyframes.snapshot()
-        result = self._adjuster.adjust(self._keyframes, self._measured.graph, frames, (0,), REFINE, free_focal=True)
+        result = self._adjust_everything(free_focal=True)
         if result is None:
             return None
         prior_sigma = self._adjuster.focal_prior.sigma
@@ -102,7 +106,11 @@ class Backend:
         logger.info("focal length held: it went to a field of view of %.1f deg, sigma %.3f", fov_deg, sigma)
         self.focal = FocalReport(prior_sigma, observed=False)
         self._keyframes.restore(before)
-        return self._adjuster.adjust(self._keyframes, self._measured.graph, frames, (0,), REFINE)
+        return self._adjust_everything(free_focal=False)
+
+    def _adjust_everything(self, *, free_focal: bool) -> Result | None:
+        frames = range(len(self._keyframes))
+        return self._adjuster.adjust(self._keyframes, self._measured.graph, frames, (0,), REFINE, free_focal=free_focal)
 
     def _mask_moving(self) -> bool:
         """Refresh the motion masks; whether any keyframe's mask changed by a visible share of its cells."""

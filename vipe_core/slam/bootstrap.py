@@ -36,6 +36,8 @@ _MAX_POINTS = 600
 _DEPTH_SPREAD = 20.0
 # Two starts that end this close have found the same minimum: no need to try more.
 _SAME_COST = 0.01
+# Share of the largest possible robust cost above which a start is not believed.
+_SUSPECT_COST = 0.1
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,6 +55,14 @@ class Seed:
     second: int
     second_from_first: NDArray[np.float64] | None
     parallax: float
+
+
+@dataclass(frozen=True, slots=True)
+class _Start:
+    """A finished start: its robust cost as a share of the largest possible, and the map."""
+
+    cost: float
+    snapshot: tuple[Array, Array, Array]
 
 
 class Bootstrap:
@@ -78,25 +88,35 @@ class Bootstrap:
             self._keyframes.normalise_scale()
 
     def _start(self) -> None:
+        """Try starts until two agree; when even the best one contradicts much of the picture, let the area decide."""
         blank = self._keyframes.snapshot()
-        best: tuple[float, Seed, tuple[Array, Array, Array]] | None = None
-        for seed in [Seed(0, 1, None, 0.0), *self._seeds()]:
+        seeds = self._seeds()
+        best = self._best_of(seeds[:_MAX_SEEDS], blank)
+        if best.cost > _SUSPECT_COST and len(seeds) > 0:
+            logger.debug("the best start costs %.3f: something large moves, or the geometry is hard", best.cost)
+            self._graph.area_votes = True
+            best = self._best_of(seeds, blank)
+        self._keyframes.restore(best.snapshot)
+
+    def _best_of(self, seeds: Sequence[Seed], blank: tuple[Array, Array, Array]) -> _Start:
+        best: _Start | None = None
+        for seed in [Seed(0, 1, None, 0.0), *seeds]:
             self._keyframes.restore(blank)
             cost = self._grow(seed)
             logger.debug("start from %d-%d (parallax %.2f): cost %.4f", seed.first, seed.second, seed.parallax, cost)
-            confirmed = best is not None and math.isfinite(cost) and abs(cost - best[0]) < _SAME_COST * cost
-            if best is None or cost < best[0]:
-                best = (cost, seed, self._keyframes.snapshot())
-            if confirmed:
+            same = best is not None and math.isfinite(cost) and abs(cost - best.cost) < _SAME_COST * cost
+            if best is None or cost < best.cost:
+                best = _Start(cost, self._keyframes.snapshot())
+            if same and cost < _SUSPECT_COST:
                 break
-        if best is not None:
-            self._keyframes.restore(best[2])
+        assert best is not None
+        return best
 
     def _seeds(self) -> list[Seed]:
-        """The pairs with most parallax, from essential matrices at the initial focal length."""
+        """The pairs with parallax, most first, from essential matrices at the initial focal length."""
         seeds = [self._two_view(i, j) for i, j in self._graph if i < j]
         found = [seed for seed in seeds if seed is not None and seed.parallax > 0]
-        return sorted(found, key=lambda seed: (-seed.parallax, seed.first, seed.second))[:_MAX_SEEDS]
+        return sorted(found, key=lambda seed: (-seed.parallax, seed.first, seed.second))
 
     def _two_view(self, i: int, j: int) -> Seed | None:
         match = self._graph[i, j]
@@ -126,7 +146,11 @@ class Bootstrap:
         return Seed(i, j, relative, parallax)
 
     def _grow(self, seed: Seed) -> float:
-        """Place the seed, then every other keyframe next to a placed one; returns the robust cost per weight."""
+        """Place the seed, then every other keyframe next to a placed one.
+
+        Returns:
+            The robust cost as a share of what it would be if nothing fitted: 0 is perfect, towards 1 is hopeless.
+        """
         keyframes = self._keyframes
         placed = [seed.first, seed.second]
         if seed.second_from_first is not None:
@@ -152,7 +176,7 @@ class Bootstrap:
         result = self._adjuster.adjust(keyframes, self._graph, placed, (seed.first,), REFINE)
         if result is None or result.weight_sum <= 0:
             return math.inf
-        return result.cost / result.weight_sum
+        return result.cost / (result.weight_sum * self._adjuster.robust_scale_px**2)
 
     def place(self, near: int, new: int, neighbours: Sequence[int]) -> None:
         """Pose keyframe `new` against the depths of placed `neighbours`, and predict its depth from `near`."""

@@ -14,6 +14,7 @@ from vipe_core.ba.problem import Edges, Free, Problem, State
 from vipe_core.geometry.arrays import interpolate_trajectory
 from vipe_core.priors.protocols import DenseMatcher, Match
 from vipe_core.slam.adjustment import Adjuster, Step
+from vipe_core.slam.graph import Graph
 from vipe_core.slam.keyframes import KeyframeMap
 from vipe_core.slam.reprojection import Reprojector, relative_pose
 from vipe_core.slam.rotation import Link, RotationFitter
@@ -55,6 +56,7 @@ class Infill:
     """Poses every frame of the video against the finished map.
 
     Args:
+        graph: Says how raw weights are to be seen.
         batch: Frames that are posed together.
         rotation_only: Fits rotations instead of poses, for a camera that only turns.
     """
@@ -62,6 +64,7 @@ class Infill:
     def __init__(
         self,
         keyframes: KeyframeMap,
+        graph: Graph,
         matcher: DenseMatcher,
         adjuster: Adjuster,
         reprojector: Reprojector,
@@ -69,6 +72,7 @@ class Infill:
         rotation_only: RotationFitter | None = None,
     ) -> None:
         self._keyframes = keyframes
+        self._graph = graph
         self._matcher = matcher
         self._adjuster = adjuster
         self._reprojector = reprojector
@@ -152,7 +156,9 @@ class Infill:
         first = len(sources)
         total = first + len(pending)
         links = [(number[k], first + row, match) for row, frame in enumerate(pending) for k, match in frame.matches]
-        weight = np.stack([match.weight * self._keyframes.static(sources[i])[:, None] for i, _, match in links])
+        weight = np.stack(
+            [self._graph.weigh(match.weight) * self._keyframes.static(sources[i])[:, None] for i, _, match in links]
+        )
         edges = Edges(
             source=torch.tensor([i for i, _, _ in links], dtype=torch.int64, device=device),
             target=torch.tensor([j for _, j, _ in links], dtype=torch.int64, device=device),
@@ -188,7 +194,7 @@ class Infill:
                 relative_pose(cam_from_world, self._keyframes.pose(k)),
                 self._keyframes.depth(k),
             )
-            weight = match.weight.mean(axis=1) * self._keyframes.static(k)
+            weight = self._graph.weigh(match.weight).mean(axis=1) * self._keyframes.static(k)
             weight = np.where(weight > _MIN_WEIGHT, weight, 0)
             error = np.linalg.norm(induced.target_px - match.target_px, axis=1)
             inside += float(weight[error < self._adjuster.robust_scale_px].sum())

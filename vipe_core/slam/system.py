@@ -149,6 +149,7 @@ class Slam:
             else:
                 infill = Infill(
                     keyframes,
+                    graph,
                     self._priors.matcher,
                     adjuster,
                     reprojector,
