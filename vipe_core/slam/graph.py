@@ -6,6 +6,7 @@ that either can change without matching again.
 
 from __future__ import annotations
 
+import bisect
 from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
@@ -49,6 +50,7 @@ class Graph:
 
     def __init__(self) -> None:
         self._matches: dict[tuple[int, int], Match] = {}
+        self._targets: dict[int, list[int]] = {}
         self.area_votes = False
 
     def __len__(self) -> int:
@@ -61,16 +63,22 @@ class Graph:
         return self._matches[edge]
 
     def add(self, source: int, target: int, match: Match) -> None:
+        if (source, target) not in self._matches:
+            bisect.insort(self._targets.setdefault(source, []), target)
         self._matches[source, target] = match
+
+    def targets(self, source: int) -> list[int]:
+        """Where the edges out of `source` lead, in order."""
+        return list(self._targets.get(source, ()))
 
     def __iter__(self) -> Iterator[tuple[int, int]]:
         """Edges in a fixed order: by source, then by target."""
-        return iter(sorted(self._matches))
+        return ((i, j) for i in sorted(self._targets) for j in self._targets[i])
 
     def among(self, frames: Iterable[int]) -> list[tuple[int, int]]:
         """The edges with both ends in `frames`, in order."""
         inside = set(frames)
-        return [edge for edge in self if edge[0] in inside and edge[1] in inside]
+        return [(i, j) for i in sorted(inside) for j in self._targets.get(i, ()) if j in inside]
 
     def weigh(self, weight: NDArray[np.float32]) -> NDArray[np.float32]:
         """Raw weights of any shape as the adjustment is to see them; see `area_votes`."""

@@ -36,11 +36,9 @@ def moving_cells(
     grid = keyframes.grid
     measured = np.zeros(grid.num_cells, dtype=np.float32)
     contradicted = np.zeros(grid.num_cells, dtype=np.float32)
-    for i, j in graph:
-        if i != k:
-            continue
-        match = graph[i, j]
-        induced = reprojector.edge(keyframes, i, j)
+    for j in graph.targets(k):
+        match = graph[k, j]
+        induced = reprojector.edge(keyframes, k, j)
         counts = (match.weight.max(axis=1) > _MIN_WEIGHT) & np.isfinite(induced.target_px).all(axis=1)
         error = np.linalg.norm(np.where(counts[:, None], induced.target_px - match.target_px, 0.0), axis=1)
         measured += counts

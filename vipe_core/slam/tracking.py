@@ -15,6 +15,8 @@ from vipe_core.slam.selection import Keyframe
 from vipe_core.slam.settings import SlamSettings
 
 _MAX_VELOCITY_RATIO = 1.5
+# Robust cost as a share of the largest possible below which a pose needs no second start.
+_GOOD_FIT = 0.1
 
 
 class Tracker:
@@ -65,7 +67,10 @@ class Tracker:
         return predicted
 
     def _pose_from_previous(self, k: int) -> None:
-        """Motion-only pose of the new keyframe against the depth of the one before, from the better of two starts."""
+        """Motion-only pose of the new keyframe against the depth of the one before.
+
+        Starts at the predicted pose, and at the previous one too when the fit from there is poor.
+        """
         starts = (self._keyframes.pose(k), self._keyframes.pose(k - 1))
         best: tuple[float, NDArray[np.float64]] | None = None
         for start in starts:
@@ -83,6 +88,8 @@ class Tracker:
                 continue
             if best is None or result.cost < best[0]:
                 best = (result.cost, self._keyframes.pose(k))
+            if result.cost < _GOOD_FIT * self._adjuster.robust_scale_px**2 * result.weight_sum:
+                break
         self._keyframes.set_pose(k, starts[0] if best is None else best[1])
 
     def _connect_returning(self, k: int) -> None:
