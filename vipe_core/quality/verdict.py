@@ -26,6 +26,7 @@ _MIN_KEYFRAMES = 5
 _LOW_PARALLAX_DEG = 1.0
 _LOW_COVERAGE = 0.35
 _HIGH_RESIDUAL_RATIO = 0.8 / 640
+_MATCHING_NOISE_PX = 0.3
 _LOW_INLIERS = 0.9
 _VERY_LOW_INLIERS = 0.6
 _WEAK_LINK = 0.08
@@ -56,7 +57,7 @@ def assess(result: SlamResult, settings: SlamSettings, source_width: int) -> Qua
         if found.coverage < _LOW_COVERAGE:
             reasons.append("low_texture")
         # Written so that a NaN residual, of a map without a single measurement, counts as high.
-        if not found.residual_px <= _HIGH_RESIDUAL_RATIO * result.working.width:
+        if not found.residual_px <= max(_MATCHING_NOISE_PX, _HIGH_RESIDUAL_RATIO * result.working.width):
             reasons.append("high_residual")
             fatal = True
         if found.inlier_ratio < _LOW_INLIERS:

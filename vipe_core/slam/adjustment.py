@@ -26,6 +26,7 @@ logger = logging.getLogger(__name__)
 
 Array = NDArray[Any]
 
+_MIN_ROBUST_SCALE_PX = 1.0
 _FAILED = (Status.SINGULAR, Status.NON_FINITE)
 
 
@@ -73,7 +74,8 @@ class Adjuster:
         self.settings = settings
         self.device = device
         self.focal_prior = focal_prior
-        self.robust_scale_px = settings.robust_scale_px * scale_px
+        # Geometry shrinks with the image, the noise of matching does not.
+        self.robust_scale_px = max(_MIN_ROBUST_SCALE_PX, settings.robust_scale_px * scale_px)
         # The cost is in px^2 of the working image: a smaller image has smaller residuals for the same geometry.
         self._depth_prior_weight = settings.depth_prior_weight * scale_px**2
 
