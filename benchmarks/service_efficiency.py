@@ -23,7 +23,7 @@ from services.cli.demo import running_service
 from services.cli.progress import show_progress
 from vipe_core.evaluation.samples import DEMO_NAMES, sample_path
 from vipe_core.formats import SequenceNames, write_artifacts
-from vipe_core.pipeline import Annotator
+from vipe_core.pipeline.annotator import Annotator
 
 
 def main() -> None:

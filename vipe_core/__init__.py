@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from vipe_core.annotation import Annotation, DenseFrame, Progress, Provenance, Quality
     from vipe_core.errors import VipeError
-    from vipe_core.pipeline import Annotator, annotate
+    from vipe_core.pipeline.annotator import Annotator, annotate
 
 __all__ = ["Annotation", "Annotator", "DenseFrame", "Progress", "Provenance", "Quality", "VipeError", "annotate"]
 
@@ -19,8 +19,8 @@ _HOMES = {
     "Provenance": "vipe_core.annotation",
     "Quality": "vipe_core.annotation",
     "VipeError": "vipe_core.errors",
-    "Annotator": "vipe_core.pipeline",
-    "annotate": "vipe_core.pipeline",
+    "Annotator": "vipe_core.pipeline.annotator",
+    "annotate": "vipe_core.pipeline.annotator",
 }
 
 

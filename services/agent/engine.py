@@ -18,7 +18,7 @@ from vipe_core.errors import ConfigError
 if TYPE_CHECKING:
     from vipe_core.annotation import Annotation
     from vipe_core.annotation import Progress as EngineProgress
-    from vipe_core.pipeline import Annotator
+    from vipe_core.pipeline.annotator import Annotator
 
 ProgressCallback = Callable[[str, int, int | None, float], None]
 """(stage, frames done in it, frames of the video where the stage knows, share of the whole work that is done, 0..1)."""
@@ -86,7 +86,7 @@ class VipeEngine:
 
 def open_engine(preset: str, camera: str, device: str) -> Engine:
     """Open the engine that ships. Imports the heavy libraries here and not in the agent."""
-    from vipe_core.pipeline import Annotator
+    from vipe_core.pipeline.annotator import Annotator
 
     return VipeEngine(Annotator(preset=preset, camera=camera, device=device))
 

@@ -12,7 +12,7 @@ import typer
 
 if TYPE_CHECKING:
     from vipe_core.annotation import Annotation
-    from vipe_core.pipeline import Annotator
+    from vipe_core.pipeline.annotator import Annotator
 
 
 def annotate(
@@ -30,7 +30,7 @@ def annotate(
 
     from vipe_core.errors import VipeError
     from vipe_core.formats import SequenceNames
-    from vipe_core.pipeline import Annotator
+    from vipe_core.pipeline.annotator import Annotator
 
     console = Console(stderr=True, quiet=as_json)
     annotator = Annotator(preset=preset, camera=camera, device=device)

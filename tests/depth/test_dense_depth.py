@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from vipe_core.cameras import Camera
-from vipe_core.depth import DenseDepth, DepthFrame, DepthSettings, SceneMap
+from vipe_core.depth.stream import DenseDepth
+from vipe_core.depth.types import DepthFrame, DepthSettings, SceneMap
 from vipe_core.errors import EngineError
 from vipe_core.evaluation.synthetic import SyntheticClip, tiny_clip
 from vipe_core.video.source import Frame, FrameStream, VideoInfo

@@ -17,8 +17,8 @@ from vipe_core.annotation import Annotation, Progress
 from vipe_core.errors import ConfigError, EmptyMedia
 from vipe_core.evaluation.synthetic.clip import ClipKind, SyntheticClip, tiny_clip
 from vipe_core.geometry import umeyama
-from vipe_core.pipeline import PRESETS, Annotator, resolve
-from vipe_core.pipeline.presets import Preset
+from vipe_core.pipeline.annotator import Annotator
+from vipe_core.pipeline.presets import PRESETS, Preset, resolve
 
 Folder = Callable[[NDArray[np.uint8], str], Path]
 

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from vipe_core import Annotator
 from vipe_core.geometry import umeyama
-from vipe_core.pipeline import Annotator
 
 
 @pytest.mark.slow

@@ -10,9 +10,10 @@ import pytest
 from vipe_core.annotation import Quality
 from vipe_core.cameras import Camera
 from vipe_core.quality import assess
-from vipe_core.slam import SlamResult, SlamSettings
 from vipe_core.slam.backend import FocalReport
 from vipe_core.slam.diagnostics import MapReport
+from vipe_core.slam.settings import SlamSettings
+from vipe_core.slam.system import SlamResult
 from vipe_core.slam.working import WorkingSize
 
 _FRAMES, _KEYFRAMES = 40, 10

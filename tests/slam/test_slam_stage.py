@@ -9,7 +9,8 @@ from exact_scene import ExactScene, trajectory
 
 from vipe_core.geometry import umeyama
 from vipe_core.geometry.arrays import inverse
-from vipe_core.slam import Slam, SlamResult, SlamSettings
+from vipe_core.slam.settings import SlamSettings
+from vipe_core.slam.system import Slam, SlamResult
 
 
 def run(scene: ExactScene, fov_deg: float = 60.0, sigma: float = 0.1) -> SlamResult:

@@ -1,6 +1,4 @@
-"""Presets and the annotator."""
+"""Presets (`presets`), and the annotator that runs them (`annotator`; public as `vipe_core.Annotator`).
 
-from vipe_core.pipeline.annotator import Annotator, annotate
-from vipe_core.pipeline.presets import CAMERAS, PRESETS, Preset, resolve
-
-__all__ = ["CAMERAS", "PRESETS", "Annotator", "Preset", "annotate", "resolve"]
+Imports nothing by itself: the API offers presets without loading the engine.
+"""

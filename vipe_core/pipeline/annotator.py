@@ -13,14 +13,15 @@ import numpy as np
 import torch
 
 from vipe_core.annotation import Annotation, DenseFrame, Progress, ProgressCallback, Provenance
-from vipe_core.depth import DenseDepth, SceneMap
+from vipe_core.depth.stream import DenseDepth
+from vipe_core.depth.types import SceneMap
 from vipe_core.pipeline.device import describe_device, resolve_device, set_threads
 from vipe_core.pipeline.presets import Preset, resolve
 from vipe_core.pipeline.provenance import library_versions
 from vipe_core.priors.classical import classical_priors
 from vipe_core.quality import assess
-from vipe_core.slam import Slam, SlamResult
 from vipe_core.slam.selection import Report
+from vipe_core.slam.system import Slam, SlamResult
 from vipe_core.video import open_source
 from vipe_core.video.source import FrameSource
 
@@ -131,7 +132,7 @@ class Annotator:
         total = len(result.timestamps_s)
         spent_s = 0.0
         stream = DenseDepth(self.preset.dense_depth).stream(source, _scene(result))
-        with closing(frame for frame in stream) as frames:
+        with closing(stream) as frames:
             while True:
                 start_s = time.perf_counter()
                 frame = next(frames, None)

@@ -7,7 +7,7 @@ import hashlib
 import json
 from dataclasses import dataclass, field
 
-from vipe_core.depth import DepthSettings
+from vipe_core.depth.types import DepthSettings
 from vipe_core.errors import ConfigError
 from vipe_core.slam.settings import SlamSettings
 

@@ -1,6 +1,4 @@
-"""From frames to poses: keyframes, tracking, global adjustment, infill (paper section 3.1)."""
+"""From frames to poses: keyframes, tracking, global adjustment, infill (paper section 3.1).
 
-from vipe_core.slam.settings import SlamSettings
-from vipe_core.slam.system import Slam, SlamResult
-
-__all__ = ["Slam", "SlamResult", "SlamSettings"]
+Imports nothing by itself, so that settings can be read without torch.
+"""
