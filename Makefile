@@ -19,7 +19,7 @@ $(VENV)/.dev: pyproject.toml requirements.lock scripts/setup.sh
 setup: $(VENV)/.dev ## .venv with everything
 
 demo: $(VENV)/.runtime ## run the service on sample videos, or on VIDEO=clip.mp4
-	@$(VENV)/bin/vipectl demo $(VIDEO)
+	@$(VENV)/bin/vipectl demo $(if $(VIDEO),"$(VIDEO)")
 
 test: setup lint types unit ## everything that CI runs
 
@@ -41,5 +41,5 @@ format: setup
 lock: ## resolve all dependencies anew into requirements.lock
 	scripts/lock.sh
 
-clean: ## remove the environment, caches and demo output
-	rm -rf $(VENV) .cache .mypy_cache .ruff_cache .pytest_cache .hypothesis vipe_output
+clean: ## remove the environment, caches and the demo's output, nothing of yours
+	rm -rf $(VENV) .cache .mypy_cache .ruff_cache .import_linter_cache .pytest_cache .hypothesis vipe_output/demo

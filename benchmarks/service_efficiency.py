@@ -11,7 +11,6 @@ slot.
 from __future__ import annotations
 
 import argparse
-import os
 import tempfile
 import time
 from datetime import datetime
@@ -58,9 +57,8 @@ def bare_loop(videos: list[Path], output: Path) -> float:
 
 def through_service(videos: list[Path], folder: Path, slots: int) -> float:
     """Frames per second of a job, from its start to its last commit; the workers are warm from a job before it."""
-    os.environ["VIPE_NUM_SLOTS"] = str(slots)
     console = Console(stderr=True)
-    with running_service(folder / "service", console) as client:
+    with running_service(folder / "service", console, slots) as client:
         for name, inputs in (
             ("warm", [str(video) for video in videos[:slots]]),
             ("timed", [str(video) for video in videos]),

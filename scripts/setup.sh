@@ -19,17 +19,26 @@ if [ -z "$python" ]; then
     exit 1
 fi
 
-[ -x .venv/bin/python ] || "$python" -m venv .venv
+# A venv whose creation failed half-way (python3-venv missing, say) has a python but no pip.
+if ! .venv/bin/python -m pip --version >/dev/null 2>&1; then
+    rm -rf .venv
+    "$python" -m venv .venv
+fi
 pip=(.venv/bin/python -m pip --disable-pip-version-check --quiet)
-torch=$(grep -E '^torch==' requirements.lock)
+locked=$(sed -n 's/^torch==//p' requirements.lock)
 
-if ! .venv/bin/python -c 'import torch' 2>/dev/null; then
-    echo "Installing $torch (${VIPE_TORCH:-cpu}) ..."
-    if [ "${VIPE_TORCH:-cpu}" = cuda ]; then
-        "${pip[@]}" install "$torch"
-    else
-        "${pip[@]}" install "$torch+cpu" 2>/dev/null ||
-            "${pip[@]}" install "$torch+cpu" --extra-index-url https://download.pytorch.org/whl/cpu
+case "${VIPE_TORCH:-cpu}-$(uname -s)" in
+    cpu-Linux) torch="torch==$locked+cpu" ;;
+    *) torch="torch==$locked" ;;
+esac
+installed=$(.venv/bin/python -c 'from importlib.metadata import version; print("torch==" + version("torch"))' 2>/dev/null || true)
+if [ "$installed" != "$torch" ]; then
+    echo "Installing $torch ..."
+    if ! log=$("${pip[@]}" install "$torch" 2>&1); then
+        "${pip[@]}" install "$torch" --extra-index-url https://download.pytorch.org/whl/cpu || {
+            echo "$log" >&2
+            exit 1
+        }
     fi
 fi
 

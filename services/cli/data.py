@@ -70,15 +70,27 @@ def export(
     """Export poses, intrinsics and depth to one file per video."""
     import tempfile
 
+    from services.dataset import DatasetIndex
     from services.dataset import unpack as unpack_dataset
     from services.storage import open_store
     from vipe_core.formats import export_npz, list_sequences
 
-    with tempfile.TemporaryDirectory(prefix="vipe-export-") as scratch:
-        folder = Path(source)
-        if not (folder / "pose").is_dir():
-            folder = Path(scratch)
-            unpack_dataset(open_store(absolute(source), endpoint_url=endpoint), folder, keys=key)
-        names = [name for name in list_sequences(folder) if not key or name in key]
-        for name in names:
-            typer.echo(export_npz(folder, name, destination / f"{name}.{format}", depth_stride=depth_stride))
+    if (Path(source) / "pose").is_dir():
+        for name in _chosen(list_sequences(source), key):
+            typer.echo(export_npz(source, name, destination / f"{name}.{format}", depth_stride=depth_stride))
+        return
+    store = open_store(absolute(source), endpoint_url=endpoint)
+    with DatasetIndex(store) as index:
+        names = _chosen([str(row["sequence"]) for row in index.rows()], key)
+    for name in names:
+        # One video at a time and without its pictures, so that an export needs little room beside its result.
+        with tempfile.TemporaryDirectory(prefix="vipe-export-") as scratch:
+            unpack_dataset(store, Path(scratch), keys=[name], attributes=("pose", "intrinsics", "depth"))
+            typer.echo(export_npz(scratch, name, destination / f"{name}.{format}", depth_stride=depth_stride))
+
+
+def _chosen(names: list[str], keys: list[str] | None) -> list[str]:
+    unknown = sorted(set(keys or ()) - set(names))
+    if unknown:
+        raise typer.BadParameter(f"no such video here: {', '.join(unknown)}")
+    return [name for name in names if not keys or name in keys]

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 
     from services.client import Client
 
+_MARKER = ".vipe-demo"
 _START_TIMEOUT_S = 120.0
 _STOP_TIMEOUT_S = 30.0
 
@@ -38,14 +39,17 @@ def demo(
 
     console = results_console()
     output = output.resolve()
-    _make_room(output)
-    samples = _samples(output / "videos", console) if not videos else {}
-    inputs = [path.resolve() for path in videos] if videos else list(samples)
+    inputs = [path.resolve() for path in videos or []]
+    _make_room(output, inputs)
+    samples = _samples(output / "videos", console) if not inputs else {}
+    inputs = inputs or list(samples)
     with running_service(output / "service", console) as client:
         job = client.submit(
             {"inputs": [str(path) for path in inputs], "output": str(output / "dataset"), "name": "demo"}
         )
-        console.print(f"Submitted [bold]{job['id']}[/] over REST: {len(inputs)} videos -> {output / 'dataset'}")
+        console.print(
+            f"Submitted [bold]{job['id']}[/] over REST: {len(inputs)} videos -> {output / 'dataset'}", soft_wrap=True
+        )
         from services.cli.progress import describe, show_progress
 
         job = show_progress(client, job["id"], console)
@@ -56,13 +60,19 @@ def demo(
         raise typer.Exit(1)
 
 
-def _make_room(output: Path) -> None:
+def _make_room(output: Path, inputs: list[Path]) -> None:
     """An earlier demo is replaced; anything else in the way is the user's and stays."""
+    for path in inputs:
+        if not path.exists():
+            raise typer.BadParameter(f"{path} does not exist")
+        if path.is_relative_to(output):
+            raise typer.BadParameter(f"{path} lies in {output}, which this run replaces; choose another --output")
     if output.exists() and any(output.iterdir()):
-        if not (output / "service").is_dir():
+        if not (output / _MARKER).is_file():
             raise typer.BadParameter(f"{output} is not empty and was not made by a demo; choose another with --output")
         shutil.rmtree(output)
     output.mkdir(parents=True, exist_ok=True)
+    (output / _MARKER).touch()
 
 
 def _samples(folder: Path, console: Console) -> dict[Path, Path]:
@@ -81,23 +91,51 @@ def _samples(folder: Path, console: Console) -> dict[Path, Path]:
 
 
 @contextlib.contextmanager
-def running_service(folder: Path, console: Console) -> Iterator[Client]:
+def running_service(folder: Path, console: Console, slots: int | None = None) -> Iterator[Client]:
     """A service process of its own on a free loopback port; stopped, children included, on the way out."""
-    from services.client import Client
-
     folder.mkdir(parents=True)
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
     log_path = folder / "service.log"
     command = [sys.executable, "-m", "services.cli.main", "up", "--port", str(port), "--data-dir", str(folder)]
-    with log_path.open("wb") as log:
-        process = subprocess.Popen(command, stdout=log, stderr=log, stdin=subprocess.DEVNULL, start_new_session=True)
+    # Settings of a production service on this machine (its database, its Ray) are not for the demo.
+    environment = {name: value for name, value in os.environ.items() if not name.startswith("VIPE_")}
+    if slots is not None:
+        environment["VIPE_NUM_SLOTS"] = str(slots)
+    with log_path.open("wb") as log, _interrupted_by_signals():
+        process = subprocess.Popen(
+            command, stdout=log, stderr=log, stdin=subprocess.DEVNULL, env=environment, start_new_session=True
+        )
+        yield from _attend(process, port, log_path, console)
+
+
+@contextlib.contextmanager
+def _interrupted_by_signals() -> Iterator[None]:
+    """SIGTERM and SIGHUP (a closed terminal) end a block like Ctrl-C does, so that it can clean up."""
+
+    def interrupt(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    before = {number: signal.signal(number, interrupt) for number in (signal.SIGTERM, signal.SIGHUP)}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def _attend(process: subprocess.Popen[bytes], port: int, log_path: Path, console: Console) -> Iterator[Client]:
+    from services.client import Client
+
     try:
         client = Client(f"http://127.0.0.1:{port}")
         with console.status("Starting the service (SQLite, local Ray, API on loopback) ..."):
             _wait_ready(client, process, log_path)
-        console.print(f"Service on http://127.0.0.1:{port} (docs at /docs, metrics at /metrics), log in {log_path}")
+        console.print(
+            f"Service on http://127.0.0.1:{port} (docs at /docs, metrics at /metrics), log in {log_path}",
+            soft_wrap=True,
+        )
         yield client
     finally:
         _stop(process)
@@ -138,9 +176,9 @@ def _report(
         return False
     dataset = open_store(str(output / "dataset"))
     report = verify(dataset, deep=True)
-    console.print(f"Verified {output / 'dataset'} by reading it back. {summary(report)}")
+    console.print(f"Verified {output / 'dataset'} by reading it back. {summary(report)}", soft_wrap=True)
     for problem in report.problems:
-        console.print(f"  {problem}", style="red")
+        console.print(f"  {problem}", style="red", soft_wrap=True)
     done = [row for row in rows if row["status"] == "succeeded"]
     scores = {}
     if done:
@@ -175,8 +213,7 @@ def _scores(done: list[dict[str, Any]], samples: dict[Path, Path], output: Path)
 
 
 def _say_what_next(console: Console, output: Path) -> None:
-    here = os.path.relpath(output)
-    vipectl = os.path.relpath(Path(sys.executable).parent / "vipectl")
+    here, vipectl = _near(output), _near(Path(sys.executable).parent / "vipectl")
     lines = (
         ("Look at the result:", ""),
         (f"  {here}/pictures/", "frames, depth and camera path of each video in one PNG"),
@@ -190,3 +227,8 @@ def _say_what_next(console: Console, output: Path) -> None:
     )
     for text, comment in lines:
         console.print(text + (f"   [dim]# {comment}[/]" if comment else ""), soft_wrap=True)
+
+
+def _near(path: Path) -> Path:
+    """Relative to the current folder where the path is below it."""
+    return path.relative_to(Path.cwd()) if path.is_relative_to(Path.cwd()) else path
