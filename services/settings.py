@@ -30,13 +30,16 @@ class Settings(BaseSettings):
     """Node-local folder for inputs, artifacts and tars in the making; default: `scratch` in `data_dir`."""
 
     host: str = "127.0.0.1"
-    """Address that the API listens on. Set `api_key` before it is anything but loopback."""
+    """Address that the API listens on. Anything but loopback needs `api_key`, or `allow_anonymous`."""
 
     port: int = Field(default=8080, ge=0, le=65535)
     """Port that the API listens on; 0 takes a free one."""
 
     api_key: SecretStr | None = None
     """When set, every `/v1` request must carry `Authorization: Bearer <api_key>`."""
+
+    allow_anonymous: bool = False
+    """Serve without an `api_key` where `host` is not loopback; something else must then keep strangers out."""
 
     max_body_bytes: int = Field(default=1 << 20, ge=1024)
     """Largest request body that the API reads."""

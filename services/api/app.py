@@ -11,7 +11,7 @@ from fastapi.openapi.utils import get_openapi
 from fastapi.security import HTTPAuthorizationCredentials, HTTPBearer
 
 from services.api import problems, routes
-from services.api.middleware import BodyLimit, RequestContext
+from services.api.middleware import BodyLimit, LoopbackHost, RequestContext, is_loopback
 from services.api.problems import Problem, Unauthorized
 from services.api.schemas import Status
 from services.observability.metrics import CONTENT_TYPE, Metrics, package_version
@@ -38,7 +38,7 @@ def create_app(store: Store, settings: Settings, metrics: Metrics | None = None)
 
     Args:
         store: Where the jobs are.
-        settings: `api_key` and `max_body_bytes` are used here.
+        settings: `host`, `api_key` and `max_body_bytes` are used here.
         metrics: What `/metrics` shows; share it with an agent in the same process. Default: one of its own.
     """
     app = FastAPI(
@@ -55,6 +55,8 @@ def create_app(store: Store, settings: Settings, metrics: Metrics | None = None)
 
     problems.install(app)
     app.add_middleware(BodyLimit, max_bytes=settings.max_body_bytes)
+    if settings.api_key is None and is_loopback(settings.host):
+        app.add_middleware(LoopbackHost)
     app.add_middleware(RequestContext, metrics=metrics)
     app.include_router(routes.router, dependencies=[Depends(authenticate)])
     app.include_router(_operations)

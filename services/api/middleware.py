@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ipaddress
 import logging
 import re
 import time
@@ -18,6 +19,39 @@ from services.observability.metrics import Metrics
 _log = logging.getLogger(__name__)
 _ID_HEADER = "X-Request-ID"
 _ACCEPTABLE_ID = re.compile(r"[A-Za-z0-9._:-]{1,128}")
+
+
+def is_loopback(host: str) -> bool:
+    """Whether a name or address (IPv6 without brackets) can only be this machine."""
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return host.lower() == "localhost"
+
+
+class LoopbackHost:
+    """Refuses requests to a loopback service under a name that is not this machine's.
+
+    A web page can point its own name at 127.0.0.1 (DNS rebinding) and then read every answer as its own; what it cannot
+    change is the name that the browser sends.
+    """
+
+    def __init__(self, app: ASGIApp) -> None:
+        self._app = app
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] == "http" and not is_loopback(_host_name(Headers(scope=scope).get("host", ""))):
+            detail = "this service answers to localhost only; to serve under a name, set VIPE_API_KEY"
+            await problems.response(scope, 400, "unknown_host", detail)(scope, receive, send)
+            return
+        await self._app(scope, receive, send)
+
+
+def _host_name(header: str) -> str:
+    """The name or address in a Host header, without port and brackets."""
+    if header.startswith("["):
+        return header[1:].partition("]")[0]
+    return header.partition(":")[0]
 
 
 class RequestContext:

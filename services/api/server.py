@@ -7,6 +7,8 @@ import socket
 import uvicorn
 from fastapi import FastAPI
 
+from services.api.middleware import is_loopback
+from services.domain.errors import InvalidRequest
 from services.settings import Settings
 
 _DRAIN_S = 10
@@ -31,7 +33,12 @@ class ApiServer(uvicorn.Server):
 
 
 def create_server(app: FastAPI, settings: Settings) -> ApiServer:
-    """A server for `create_app`'s application at the address of the settings. Logging stays as it is configured."""
+    """A server for `create_app`'s application at the address of the settings. Logging stays as it is configured.
+
+    Raises:
+        InvalidRequest: Whoever reaches the address could use it: no key, not loopback, and nobody said that it may be.
+    """
+    check_exposure(settings)
     config = uvicorn.Config(
         app,
         host=settings.host,
@@ -43,3 +50,12 @@ def create_server(app: FastAPI, settings: Settings) -> ApiServer:
         timeout_graceful_shutdown=_DRAIN_S,
     )
     return ApiServer(app, config)
+
+
+def check_exposure(settings: Settings) -> None:
+    """Raises InvalidRequest where `create_server` would; for a program that starts other things first."""
+    if settings.api_key is None and not settings.allow_anonymous and not is_loopback(settings.host):
+        raise InvalidRequest(
+            f"the API would answer everybody who reaches {settings.host}: set VIPE_API_KEY,"
+            " or VIPE_ALLOW_ANONYMOUS=true where something else keeps strangers out"
+        )

@@ -9,8 +9,9 @@ from pathlib import Path
 import httpx
 import pytest
 from api_helpers import assert_problem, submit
-from conftest import running
+from conftest import Service, running
 from openapi_spec_validator import validate
+from pydantic import SecretStr
 
 from services.api import create_app, create_server, problems
 from services.domain import errors
@@ -85,6 +86,34 @@ def test_with_a_key(tmp_path: Path) -> None:
         right = {"Authorization": "Bearer secret"}
         assert httpx.get(f"{service.url}/v1/jobs", headers=right).json() == {"items": [], "next_page_token": None}
         assert httpx.get(f"{service.url}/healthz").status_code == 200
+
+
+def test_a_public_address_needs_a_key(tmp_path: Path) -> None:
+    store = SqlStore(f"sqlite:///{tmp_path}/store.db")
+    for host in ("0.0.0.0", "::", "10.1.2.3", "gpu-box"):
+        public = Settings(host=host, port=0)
+        with pytest.raises(errors.InvalidRequest, match=f"{host}.*VIPE_API_KEY.*VIPE_ALLOW_ANONYMOUS"):
+            create_server(create_app(store, public), public)
+    for allowed in (
+        Settings(host="0.0.0.0", api_key=SecretStr("secret")),
+        Settings(host="0.0.0.0", allow_anonymous=True),
+        Settings(host="::1"),
+        Settings(host="localhost"),
+    ):
+        create_server(create_app(store, allowed), allowed)
+    store.close()
+
+
+def test_other_names_for_this_machine_are_refused(http: httpx.Client, service: Service, tmp_path: Path) -> None:
+    port = service.url.rsplit(":", 1)[1]
+    for host in ("localhost", f"LocalHost:{port}", f"127.0.0.1:{port}", "127.0.0.1", f"[::1]:{port}"):
+        assert http.get("/v1/jobs", headers={"Host": host}).status_code == 200, host
+    for host in ("evil.example", f"evil.example:{port}", "localhost.evil.example", "127.0.0.1.evil.example", ""):
+        for path in ("/v1/jobs", "/metrics", "/healthz"):
+            assert_problem(http.get(path, headers={"Host": host}), 400, "unknown_host")
+    with running(f"sqlite:///{tmp_path}/store.db", "api_key=secret") as guarded:  # as behind a proxy of this machine
+        headers = {"Host": "vipe.example", "Authorization": "Bearer secret"}
+        assert httpx.get(f"{guarded.url}/v1/jobs", headers=headers).status_code == 200
 
 
 def test_a_defect_is_a_problem_too(tmp_path: Path) -> None:

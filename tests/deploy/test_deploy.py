@@ -18,7 +18,9 @@ import pytest
 import yaml
 from typer.main import get_command
 
+from services.api.server import check_exposure
 from services.cli.main import app
+from services.domain.errors import InvalidRequest
 from services.observability.metrics import Metrics
 from services.settings import Settings
 
@@ -147,6 +149,16 @@ def test_container_commands_exist_in_the_program() -> None:
         subcommand = program.commands[name]  # type: ignore[attr-defined]
         with subcommand.make_context(name, arguments):
             pass  # click parsed every option
+
+
+def test_every_api_that_listens_beyond_its_container_has_a_key() -> None:
+    assert ["vipectl", "api", "--host", "0.0.0.0", "--port", "8080"] in shell_commands()
+    with pytest.raises(InvalidRequest):
+        check_exposure(Settings(host="0.0.0.0"))
+    assert "VIPE_API_KEY" in compose()["services"]["api"]["environment"]
+    assert "VIPE_API_KEY" not in compose()["services"]["agent"]["environment"]
+    (api,) = (d for d in manifests() if d["kind"] == "Deployment" and d["metadata"]["name"] == "vipe-api")
+    assert "VIPE_API_KEY" in {variable["name"] for container in containers(api) for variable in container["env"]}
 
 
 def test_compose_builds_targets_that_the_dockerfile_has() -> None:
