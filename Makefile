@@ -2,6 +2,7 @@
 
 VENV := .venv
 VIDEO ?=
+TEST_PROCESSES ?= 2
 export OMP_WAIT_POLICY ?= passive
 # Ray and matplotlib must not phone home or open windows.
 export RAY_USAGE_STATS_ENABLED := 0
@@ -32,7 +33,7 @@ types: setup
 	$(VENV)/bin/mypy
 
 unit: setup
-	$(VENV)/bin/python -m pytest $(PYTEST_ARGS)
+	$(VENV)/bin/python -m pytest --numprocesses $(TEST_PROCESSES) --dist worksteal $(PYTEST_ARGS)
 
 format: setup
 	$(VENV)/bin/ruff check --fix .
