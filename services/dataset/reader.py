@@ -22,6 +22,7 @@ from services.domain.errors import IntegrityError, ObjectMissing
 from services.domain.models import Attribute
 from services.storage.base import ObjectStore
 from services.storage.object_file import open_object
+from services.storage.open import open_store
 from vipe_core.annotation import DepthKind
 from vipe_core.cameras import Camera
 from vipe_core.errors import FormatError
@@ -83,12 +84,13 @@ class Sample:
             raise FormatError(f"{self.key}.zip: a depth map is missing or damaged") from error
 
 
-def iterate(store: ObjectStore, attributes: Sequence[Attribute] | None = None) -> Iterator[Sample]:
+def iterate(source: ObjectStore | str, attributes: Sequence[Attribute] | None = None) -> Iterator[Sample]:
     """All samples, in the order of the index's tars; the tars of a shard are read side by side, front to back.
 
     Holds one sample at a time, as bytes; for very long videos `read_one` with fewer attributes needs less.
 
     Args:
+        source: The output, or its address.
         attributes: What to read on top of poses and intrinsics; None for all that the data set has.
 
     Raises:
@@ -96,6 +98,7 @@ def iterate(store: ObjectStore, attributes: Sequence[Attribute] | None = None) -
         IntegrityError: Tars of a shard do not hold the same samples in the same order as each other, or not those of
             the index.
     """
+    store = open_store(source) if isinstance(source, str) else source
     with DatasetIndex(store) as index:
         for tar_name, rows in index.shards():
             wanted = _present(store, tar_name, attributes)
@@ -110,12 +113,18 @@ def iterate(store: ObjectStore, attributes: Sequence[Attribute] | None = None) -
                 raise IntegrityError(f"{tar_name} holds {seen} of the {len(rows)} samples of the index")
 
 
-def read_one(store: ObjectStore, key: str, attributes: Sequence[Attribute] | None = None) -> Sample:
+def read_one(source: ObjectStore | str, key: str, attributes: Sequence[Attribute] | None = None) -> Sample:
     """One sample by range requests, without the rest of its tars.
+
+    Args:
+        source: The output, or its address.
+        key: The sequence.
+        attributes: As `iterate` has it.
 
     Raises:
         ObjectMissing: No such sequence, or the data set is not finalised.
     """
+    store = open_store(source) if isinstance(source, str) else source
     with DatasetIndex(store) as index:
         row = index.row(key)
     if row is None:

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import io
+import re
 import tarfile
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import av
 import numpy as np
@@ -53,6 +55,26 @@ def test_one_sample_by_name(any_finished: ObjectStore) -> None:
         _check(read_one(any_finished, key), count)
     with pytest.raises(ObjectMissing, match="bad-1"):
         read_one(any_finished, "bad-1")
+
+
+def test_by_address(any_finished: ObjectStore, request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    if any_finished.uri.startswith("s3://"):
+        monkeypatch.setenv("VIPE_S3_ENDPOINT_URL", request.getfixturevalue("s3_endpoint"))
+    assert [sample.key for sample in iterate(any_finished.uri)] == ["ant-2", "cat-1", "dog-3"]
+    _check(read_one(any_finished.uri, "cat-1"), 3)
+
+
+def test_the_snippet_of_the_readme_runs(finished: DirectoryStore, capsys: pytest.CaptureFixture[str]) -> None:
+    readme = (Path(__file__).resolve().parents[2] / "README.md").read_text()
+    (snippet,) = (code for code in re.findall(r"```python\n(.*?)```", readme, re.S) if "services.dataset" in code)
+    for written in re.findall(r'"(/data/[^"]+|s3://[^"]+)"', snippet):
+        snippet = snippet.replace(f'"{written}"', repr(finished.uri.removeprefix("file://")))
+    snippet, replaced = re.subn(r'(read_one\([^,]+, )"[^"]+"', r'\1"dog-3"', snippet)
+    assert replaced == 1
+    variables: dict[str, Any] = {}
+    exec(compile(snippet, "README.md", "exec"), variables)
+    assert [line.split()[0] for line in capsys.readouterr().out.splitlines()] == ["ant-2", "cat-1", "dog-3"]
+    _check(variables["sample"], 4)
 
 
 def test_attributes_can_be_left_out(finished: DirectoryStore) -> None:
