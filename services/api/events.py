@@ -11,11 +11,12 @@ from typing import Any
 import anyio
 from anyio.to_thread import run_sync
 from sse_starlette import EventSourceResponse, ServerSentEvent
+from starlette.responses import Response
 
 from services.api import paging
 from services.api.schemas import EventPage, EventView, JobView
 from services.domain.errors import InvalidPageToken, StoreUnavailable
-from services.domain.events import EventKind
+from services.domain.events import ends_history
 from services.domain.models import Event, Job
 from services.domain.states import JobState
 from services.store.base import Store
@@ -46,14 +47,18 @@ def event_page(store: Store, job_id: str, *, limit: int, page_token: str | None)
     return EventPage(items=[EventView.of(event) for event in events], next_page_token=following)
 
 
-def event_stream(store: Store, job_id: str, *, after_seq: int, draining: threading.Event) -> EventSourceResponse:
+def event_stream(store: Store, job_id: str, *, after_seq: int, draining: threading.Event) -> Response:
     """The history behind `after_seq` and everything that follows until the job has ended or the server drains.
+
+    A reader who knows the last event already gets 204, which tells an `EventSource` not to come back.
 
     Raises:
         JobNotFound: There is no such job (before the stream begins).
     """
     job = store.get_job(job_id)
     first = store.events(job_id, after_seq=after_seq, limit=_BATCH)
+    if job.state.terminal and not first:  # The job was read first, so its last event would be there.
+        return Response(status_code=204)
     # Without an event of its own and some grace, the library cuts streams off when the server stops.
     return EventSourceResponse(
         _follow(store, job, after_seq, first, draining),
@@ -76,7 +81,7 @@ async def _follow(
         for event in events:
             seq = event.seq
             yield _sse(event)
-            if EventKind(event.kind).terminal:
+            if ends_history(event.kind):
                 return
         # The reader knows the job's last event already.
         if job.state.terminal and not events:

@@ -30,6 +30,11 @@ def cursor(page_token: str | None, *, of: str) -> str | None:
     except (ValueError, binascii.Error):
         decoded = None
     match decoded:
-        case [str(owner), str(position)] if owner == of:
+        case [str(owner), str(position)] if owner == of and _storable(position):
             return position
     raise InvalidPageToken("this page_token was not given out for this list; start again without one")
+
+
+def _storable(position: str) -> bool:
+    """Whether a database can compare with it: JSON can spell NUL and halves of surrogate pairs, text columns cannot."""
+    return "\x00" not in position and not any("\ud800" <= char <= "\udfff" for char in position)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Annotated
 
 from fastapi import APIRouter, Depends, Header, Path, Query, Request, Response
+from pydantic import AfterValidator
 
 from services.api import paging
 from services.api.events import LAST_EVENT_ID, event_page, event_stream, wants_stream
@@ -19,10 +20,19 @@ from services.api.schemas import (
     VideoPage,
     VideoView,
 )
+from services.domain.errors import JobNotFound
 from services.domain.states import JobState, VideoStatus
 from services.store.base import Store
 
-JobId = Annotated[str, Path(max_length=64, description="`job_...`")]
+
+def _storable(job_id: str) -> str:
+    """An id that no database can hold belongs to no job."""
+    if "\x00" in job_id:
+        raise JobNotFound(f"there is no job {job_id!r}")
+    return job_id
+
+
+JobId = Annotated[str, Path(max_length=64, description="`job_...`"), AfterValidator(_storable)]
 Limit = Annotated[int, Query(ge=1, le=1000, description="Most items on the page.")]
 PageToken = Annotated[str | None, Query(max_length=1024, description="`next_page_token` of the page before.")]
 
@@ -105,7 +115,7 @@ def list_videos(
     job_id: JobId,
     store: TheStore,
     status: VideoStatus | None = None,
-    error_code: Annotated[str | None, Query(max_length=64)] = None,
+    error_code: Annotated[str | None, Query(max_length=64, pattern=r"^[a-z0-9_]+$")] = None,
     limit: Limit = 100,
     page_token: PageToken = None,
 ) -> VideoPage:
@@ -131,6 +141,9 @@ def list_shards(job_id: JobId, store: TheStore, limit: Limit = 100, page_token: 
         200: {
             "description": "A stream of events, or with `Accept: application/json` a page of them.",
             "content": {"text/event-stream": {"schema": {"type": "string"}}},
+        },
+        204: {
+            "description": "The job has ended, and `Last-Event-ID` names its last event: there is nothing to follow."
         },
         **responses(400, 401, 404, 422, 503),
     },

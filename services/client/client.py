@@ -13,7 +13,7 @@ import httpx
 
 from services.client.sse import parse_events
 from services.domain.errors import JobNotCancellable
-from services.domain.events import EventKind
+from services.domain.events import ends_history
 from services.domain.models import JobSpec
 from services.domain.states import JobState
 
@@ -139,6 +139,8 @@ class Client:
             try:
                 headers = {"Accept": "text/event-stream", "Last-Event-ID": str(seq)}
                 with self._http.stream("GET", f"/v1/jobs/{job_id}/events", headers=headers) as response:
+                    if response.status_code == 204:
+                        return
                     if response.status_code != 200:
                         response.read()
                         raise _api_error(response)
@@ -150,7 +152,7 @@ class Client:
                         seq = int(event.id or seq)
                         received = True
                         yield event.json()
-                        if EventKind(event.name).terminal:
+                        if ends_history(event.name):
                             return
                 # It ended early because the service stops, or because the job's last event was known already.
                 if ended and not received:

@@ -30,6 +30,11 @@ class EventKind(StrEnum):
         return self in _TERMINAL
 
 
+def ends_history(kind: str) -> bool:
+    """Whether a job's history ends with an event of this name. A name from a newer release is not the end."""
+    return kind in _TERMINAL
+
+
 def job_event(state: JobState) -> EventKind:
     """The event that a job writes when it enters a state."""
     return EventKind(f"job.{state.value}")

@@ -26,15 +26,18 @@ def submit(http: httpx.Client, **changes: Any) -> str:
 
 
 def plan(store: Store, job_id: str, shards: int = 2, videos_each: int = 2) -> None:
-    assert store.begin_planning(job_id)
+    fence = store.begin_planning(job_id, "planner", ttl_s=60)
+    assert fence is not None
     store.add_shards(
         job_id,
+        fence,
         [
             ShardPlan(i, tuple(VideoRef(f"s{i}v{k}", f"/videos/s{i}v{k}.mp4", 10) for k in range(videos_each)))
             for i in range(shards)
         ],
+        ttl_s=60,
     )
-    store.finish_planning(job_id)
+    store.finish_planning(job_id, fence)
 
 
 def claim(store: Store, job_id: str) -> list[Lease]:

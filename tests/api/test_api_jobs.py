@@ -8,6 +8,7 @@ import httpx
 import pytest
 from api_helpers import assert_problem, body, claim, finish, plan, submit
 
+from services.api import paging
 from services.domain.models import LeaseProgress
 from services.store.sql import SqlStore
 
@@ -105,6 +106,15 @@ class TestCreate:
         assert_problem(http.post("/v1/jobs", data={"inputs": "/a"}), 415, "unsupported_media_type")
         assert_problem(http.post("/v1/jobs", content=b"{}"), 415, "unsupported_media_type")
 
+    def test_text_that_is_no_unicode(self, http: httpx.Client) -> None:
+        headers = {"Content-Type": "application/json"}
+        for text in (
+            '{"inputs": ["/a"], "output": "/b", "name": "\\ud800"}',
+            '{"\\ud800": 1}',
+            '{"inputs": ["/\\ud800"]}',
+        ):
+            assert_problem(http.post("/v1/jobs", content=text.encode(), headers=headers), 422, "invalid_request")
+
     def test_a_body_that_is_too_large(self, http: httpx.Client) -> None:
         headers = {"Content-Type": "application/json"}
         big = b" " * (1 << 20) + b"{}"
@@ -174,12 +184,23 @@ class TestRead:
         target = path.format(submit(http))
         headers = {"Accept": "application/json"}
         elsewhere = "WyJlbHNld2hlcmUiLCAiMSJd"  # ["elsewhere", "1"]
-        for token in ("garbage", "", "ÿ", elsewhere, "bnVsbA"):
+        name = "jobs" if path == "/v1/jobs" else f"{path.rsplit('/', 1)[1]} of {target.split('/')[3]}"
+        unstorable = [paging.token(cursor, of=name) for cursor in ("\ud800", "7\udfff", "a\x00b")]
+        for token in ("garbage", "", "ÿ", elsewhere, "bnVsbA", *unstorable):
             answer = http.get(target, params={"page_token": token}, headers=headers)
             assert_problem(answer, 400, "invalid_page_token")
         for limit in ("0", "1001", "many"):
             answer = http.get(target, params={"limit": limit}, headers=headers)
             assert assert_problem(answer, 422, "invalid_request")["errors"][0]["field"] == "query.limit"
+
+    @pytest.mark.parametrize("path", ["", "/videos", "/shards", "/events"])
+    def test_an_id_that_no_database_can_hold(self, http: httpx.Client, path: str) -> None:
+        assert_problem(http.get(f"/v1/jobs/job_%00{path}"), 404, "job_not_found")
+        assert_problem(http.get(f"/v1/jobs/job_%ED%A0%80{path}"), 404, "job_not_found")
+
+    def test_an_error_code_that_cannot_be(self, http: httpx.Client) -> None:
+        answer = http.get(f"/v1/jobs/{submit(http)}/videos?error_code=a%00b")
+        assert assert_problem(answer, 422, "invalid_request")["errors"][0]["field"] == "query.error_code"
 
     def test_unknown_states(self, http: httpx.Client) -> None:
         assert_problem(http.get("/v1/jobs", params={"state": "bored"}), 422, "invalid_request")
