@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import secrets
 import threading
+from collections.abc import Callable
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Depends, FastAPI, Request, Response
@@ -13,7 +14,7 @@ from fastapi.security import HTTPAuthorizationCredentials, HTTPBearer
 from services.api import problems, routes
 from services.api.middleware import BodyLimit, LoopbackHost, RequestContext, is_loopback
 from services.api.problems import Problem, Unauthorized
-from services.api.schemas import Status
+from services.api.schemas import Readiness, Status
 from services.observability.metrics import CONTENT_TYPE, Metrics, package_version
 from services.settings import Settings
 from services.store.base import Store
@@ -33,13 +34,19 @@ def authenticate(
         raise Unauthorized("send the service's key as `Authorization: Bearer <key>`")
 
 
-def create_app(store: Store, settings: Settings, metrics: Metrics | None = None) -> FastAPI:
+def create_app(
+    store: Store,
+    settings: Settings,
+    metrics: Metrics | None = None,
+    agent_ready: Callable[[], bool] | None = None,
+) -> FastAPI:
     """The API over a store. The caller opens and closes the store.
 
     Args:
         store: Where the jobs are.
         settings: `host`, `api_key` and `max_body_bytes` are used here.
         metrics: What `/metrics` shows; share it with an agent in the same process. Default: one of its own.
+        agent_ready: Whether the agent in the same process can work, shown by `/readyz`; None where there is no agent.
     """
     app = FastAPI(
         title="ViPE annotation service",
@@ -51,6 +58,7 @@ def create_app(store: Store, settings: Settings, metrics: Metrics | None = None)
     app.state.store = store
     app.state.settings = settings
     app.state.metrics = metrics
+    app.state.agent_ready = agent_ready
     app.state.draining = threading.Event()
 
     problems.install(app)
@@ -73,11 +81,14 @@ def healthz() -> Status:
     return Status()
 
 
-@_operations.get("/readyz", responses=problems.responses(503))
-def readyz(request: Request) -> Status:
-    """The store answers too."""
+@_operations.get("/readyz", responses=problems.responses(503), response_model_exclude_none=True)
+def readyz(request: Request) -> Readiness:
+    """The store answers too. An agent beside the API is shown, but jobs are accepted without it."""
     request.app.state.store.ping()
-    return Status()
+    agent_ready: Callable[[], bool] | None = request.app.state.agent_ready
+    if agent_ready is None:
+        return Readiness()
+    return Readiness(agent="ready" if agent_ready() else "starting")
 
 
 @_operations.get("/metrics", response_class=Response, responses={200: {"content": {"text/plain": {}}}})

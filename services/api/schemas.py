@@ -209,3 +209,10 @@ class EventPage(BaseModel):
 
 class Status(BaseModel):
     status: Literal["ok"] = "ok"
+
+
+class Readiness(Status):
+    agent: Literal["ready", "starting"] | None = Field(
+        default=None,
+        description="Whether the agent in this process has a worker; until then jobs stay queued. Absent: no agent.",
+    )

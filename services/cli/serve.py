@@ -7,13 +7,14 @@ import logging
 import os
 import signal
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 if TYPE_CHECKING:
+    from services.agent.agent import Agent
     from services.observability.metrics import Metrics
     from services.settings import Settings
     from services.store.sql import SqlStore
@@ -47,8 +48,8 @@ def up(
         settings = settings.model_copy(update={"lease_ttl_s": _EMBEDDED_LEASE_TTL_S})
     with _open_store(settings) as store:
         metrics = _metrics()
-        with _running_agent(store, settings, metrics):
-            _serve_api(store, settings, metrics)
+        with _running_agent(store, settings, metrics) as running:
+            _serve_api(store, settings, metrics, lambda: running.ready)
 
 
 def api(host: Host = None, port: Port = None, database_url: Database = None) -> None:
@@ -113,7 +114,7 @@ def _open_store(settings: Settings) -> Iterator[SqlStore]:
 
 
 @contextlib.contextmanager
-def _running_agent(store: SqlStore, settings: Settings, metrics: Metrics) -> Iterator[None]:
+def _running_agent(store: SqlStore, settings: Settings, metrics: Metrics) -> Iterator[Agent]:
     from services.agent.agent import Agent
     from services.agent.config import config_from_settings
     from services.agent.ray_executor import RayExecutor
@@ -122,15 +123,17 @@ def _running_agent(store: SqlStore, settings: Settings, metrics: Metrics) -> Ite
     running = Agent(store, config, RayExecutor(config), metrics)
     running.start()
     try:
-        yield
+        yield running
     finally:
         running.stop()
 
 
-def _serve_api(store: SqlStore, settings: Settings, metrics: Metrics) -> None:
+def _serve_api(
+    store: SqlStore, settings: Settings, metrics: Metrics, agent_ready: Callable[[], bool] | None = None
+) -> None:
     from services.api import create_app, create_server
 
-    server = create_server(create_app(store, settings, metrics), settings)
+    server = create_server(create_app(store, settings, metrics, agent_ready), settings)
     # uvicorn raises the signal again once it has stopped; the process must live on to stop the agent.
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: None)

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import contextlib
 import threading
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
 import httpx
 import pytest
 from api_helpers import assert_problem, submit
 from conftest import Service, running
+from fastapi import FastAPI
 from openapi_spec_validator import validate
 from pydantic import SecretStr
 
@@ -125,20 +128,40 @@ def test_a_defect_is_a_problem_too(tmp_path: Path) -> None:
             raise errors.StoreUnavailable("the database does not answer; try again")
 
     store = BrokenStore(f"sqlite:///{tmp_path}/store.db")
-    settings = Settings(port=0)
-    server = create_server(create_app(store, settings), settings)
+    with serving(create_app(store, Settings(port=0))) as url:
+        problem = assert_problem(httpx.get(f"{url}/metrics"), 500, "internal_error")
+        assert "secret" not in problem["detail"]
+        answer = httpx.get(f"{url}/readyz")
+        assert_problem(answer, 503, "store_unavailable")
+        assert answer.headers["retry-after"]
+    store.close()
+
+
+@contextlib.contextmanager
+def serving(app: FastAPI) -> Iterator[str]:
+    """The application in this process, where a test needs a part that cannot be named on a command line."""
+    server = create_server(app, app.state.settings)
     thread = threading.Thread(target=server.run)
     thread.start()
     while not server.started:
         time.sleep(0.01)
-    problem = assert_problem(httpx.get(f"{server.url}/metrics"), 500, "internal_error")
-    assert "secret" not in problem["detail"]
-    answer = httpx.get(f"{server.url}/readyz")
-    assert_problem(answer, 503, "store_unavailable")
-    assert answer.headers["retry-after"]
-    server.should_exit = True
-    thread.join(timeout=30)
-    assert not thread.is_alive()
+    try:
+        yield server.url
+    finally:
+        server.should_exit = True
+        thread.join(timeout=30)
+        assert not thread.is_alive()
+
+
+def test_an_agent_that_has_no_worker_is_shown(tmp_path: Path) -> None:
+    """With Ray down the API goes on taking jobs; why they stay queued must be visible."""
+    ready = threading.Event()
+    store = SqlStore(f"sqlite:///{tmp_path}/store.db")
+    with serving(create_app(store, Settings(port=0), agent_ready=ready.is_set)) as url:
+        starting = httpx.get(f"{url}/readyz")
+        assert (starting.status_code, starting.json()) == (200, {"status": "ok", "agent": "starting"})
+        ready.set()
+        assert httpx.get(f"{url}/readyz").json() == {"status": "ok", "agent": "ready"}
     store.close()
 
 
