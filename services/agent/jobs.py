@@ -71,7 +71,11 @@ class JobKeeper:
             return False
         try:
             busy = plan_next(
-                self._store, input_roots=self._config.input_roots, s3_endpoint_url=self._config.s3_endpoint_url
+                self._store,
+                self._config.holder,
+                ttl_s=self._config.lease_ttl_s,
+                input_roots=self._config.input_roots,
+                s3_endpoint_url=self._config.s3_endpoint_url,
             )
         except Exception as error:
             delay_s = self._planning.failed()

@@ -2,6 +2,6 @@
 
 from __future__ import annotations
 
-from services.planner.planning import plan, plan_next
+from services.planner.planning import Turn, plan, plan_next
 
-__all__ = ["plan", "plan_next"]
+__all__ = ["Turn", "plan", "plan_next"]

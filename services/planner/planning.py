@@ -1,6 +1,7 @@
 """Plan a job: take its output, list its inputs, write its shards.
 
-Shards are written in their order, a batch per transaction. Planning that was cut off goes on behind the last shard that
+One planner at a time: the store gives it a fence and refuses whoever holds an older one. Shards are written in their
+order, a batch per transaction, and each batch renews the planner's time. Planning that was cut off goes on behind the last shard that
 is there and leaves out every video that has a place already: unchanged inputs then give the plan that an undisturbed
 run gives, and inputs that changed meanwhile lose no video and double none.
 """
@@ -10,29 +11,34 @@ from __future__ import annotations
 import itertools
 import json
 import logging
-from collections.abc import Iterator, Sequence
+import time
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import TypeVar
 
 from services.domain.errors import OutputInUse, OutputUnsupported, ServiceError
 from services.domain.models import Job, ShardPlan
-from services.domain.states import JobState
 from services.planner.listing import Found, expand
 from services.planner.packing import SeenVideos, new_videos, pack
 from services.storage.base import ObjectStore
 from services.storage.open import open_store, supports_create_once
-from services.store.base import Store
+from services.store.base import Store, VideoRow
 
 CLAIM_KEY = "_job.json"
 
 _log = logging.getLogger(__name__)
 _BATCH_SHARDS = 64
 _PAGE = 1000
+_T = TypeVar("_T")
 
 
 def plan_next(
     store: Store,
+    holder: str,
     *,
+    ttl_s: float = 60.0,
     input_roots: Sequence[Path] = (),
     s3_endpoint_url: str | None = None,
     give_up_after_s: float = 120.0,
@@ -41,6 +47,8 @@ def plan_next(
 
     Args:
         store: Where the jobs are.
+        holder: Who plans: a name that no other planner ever has.
+        ttl_s: Another planner takes over what nothing was heard of for so long.
         input_roots: Where local inputs must lie; empty: anywhere.
         s3_endpoint_url: S3 service other than AWS.
         give_up_after_s: For how long storage that does not answer is asked again.
@@ -51,24 +59,64 @@ def plan_next(
     Raises:
         ServiceError: Something that can pass: call again later.
     """
-    job = store.next_unplanned()
+    job = store.next_unplanned(holder)
     if job is None:
         return False
-    if not store.begin_planning(job.id):
+    fence = store.begin_planning(job.id, holder, ttl_s=ttl_s)
+    if fence is None:
         return True
+    turn = Turn(store, job.id, fence, ttl_s)
     try:
-        plan(store.get_job(job.id), store, input_roots=input_roots, s3_endpoint_url=s3_endpoint_url)
+        plan(turn, input_roots=input_roots, s3_endpoint_url=s3_endpoint_url)
     except ServiceError as error:
         since = (datetime.now(UTC) - (job.started_at or datetime.now(UTC))).total_seconds()
         if error.retryable and since < give_up_after_s:
             raise
         _log.warning("job %s cannot be planned: %s", job.id, error)
-        store.fail_job(job.id, error.code, str(error))
+        store.fail_job(job.id, error.code, str(error), planning_fence=fence)
     return True
 
 
-def plan(job: Job, store: Store, *, input_roots: Sequence[Path] = (), s3_endpoint_url: str | None = None) -> None:
-    """Write the shards of a job for which `Store.begin_planning` said True. Stops if the job is cancelled meanwhile.
+@dataclass(slots=True)
+class Turn:
+    """A planner's right to plan one job, as `Store.begin_planning` gave it.
+
+    Attributes:
+        clock: Monotonic seconds.
+    """
+
+    store: Store
+    job_id: str
+    fence: int
+    ttl_s: float
+    clock: Callable[[], float] = time.monotonic
+    _heard_s: float = field(init=False)
+
+    def __post_init__(self) -> None:
+        self._heard_s = self.clock()
+
+    def keep(self, items: Iterable[_T]) -> Iterator[_T]:
+        """Pass items through and renew on the way: a listing may need longer for one batch than the time that is given.
+
+        Ends early where the turn is lost.
+        """
+        for item in items:
+            if self.clock() - self._heard_s > self.ttl_s / 3:
+                self._heard_s = self.clock()
+                if not self.store.renew_planning(self.job_id, self.fence, ttl_s=self.ttl_s):
+                    return
+            yield item
+
+    def add(self, batch: list[ShardPlan]) -> bool:
+        self._heard_s = self.clock()
+        return self.store.add_shards(self.job_id, self.fence, batch, ttl_s=self.ttl_s)
+
+    def finish(self) -> bool:
+        return self.store.finish_planning(self.job_id, self.fence)
+
+
+def plan(turn: Turn, *, input_roots: Sequence[Path] = (), s3_endpoint_url: str | None = None) -> None:
+    """Write the shards of a job. Stops if it is cancelled meanwhile, or another planner's turn.
 
     Raises:
         InputUnavailable: An input does not exist or holds no video.
@@ -76,9 +124,11 @@ def plan(job: Job, store: Store, *, input_roots: Sequence[Path] = (), s3_endpoin
         OutputUnsupported: The output's storage cannot decide between two writers.
         StorageError: Storage does not answer.
     """
+    job = turn.store.get_job(turn.job_id)  # Not before the turn began: from now on nobody else adds shards.
     with SeenVideos() as seen:
-        _remember_planned(job, store, seen)
-        found = _expand_all(job.spec.inputs, input_roots, s3_endpoint_url)
+        for row in turn.keep(_planned(job, turn.store)):
+            seen.add(row.ref.key, row.ref.uri)
+        found = turn.keep(_expand_all(job.spec.inputs, input_roots, s3_endpoint_url))
         shards = pack(
             new_videos(found, seen),
             max_videos=job.spec.shard_max_videos,
@@ -89,10 +139,9 @@ def plan(job: Job, store: Store, *, input_roots: Sequence[Path] = (), s3_endpoin
             if number == 0:
                 # Not before the first shard: a job whose inputs are wrong leaves no trace in its output.
                 claim_output(open_store(job.spec.output, endpoint_url=s3_endpoint_url), job.id)
-            store.add_shards(job.id, batch)
-            if store.get_job(job.id).state is not JobState.RUNNING:
+            if not turn.add(batch):
                 return
-        store.finish_planning(job.id)
+        turn.finish()
 
 
 def claim_output(output: ObjectStore, job_id: str) -> None:
@@ -129,13 +178,11 @@ def _batches(shards: Iterator[ShardPlan]) -> Iterator[list[ShardPlan]]:
         yield batch
 
 
-def _remember_planned(job: Job, store: Store, seen: SeenVideos) -> None:
-    if job.progress.shards_total == 0:
-        return
+def _planned(job: Job, store: Store) -> Iterator[VideoRow]:
+    """The videos that have a place already."""
     after: str | None = None
     while True:
         rows, after = store.list_videos(job.id, limit=_PAGE, after=after)
-        for row in rows:
-            seen.add(row.ref.key, row.ref.uri)
+        yield from rows
         if after is None:
             return

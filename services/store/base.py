@@ -60,18 +60,39 @@ class Store(Protocol):
         """Move to cancelling (a job without live leases is cancelled at once). Raises JobNotCancellable when ended."""
 
     # Planning -------------------------------------------------------------------------------------------------------
-    def next_unplanned(self) -> Job | None:
-        """The oldest job that is queued, or running with planning unfinished."""
+    # One planner at a time plans a job. Its fence grows with every `begin_planning`; what comes with a smaller one is
+    # refused, so a planner that slept through the end of its time can neither leave a gap nor close the plan over one.
+    def next_unplanned(self, holder: str) -> Job | None:
+        """The oldest job that is queued, or running with planning unfinished, and that no other live planner holds."""
 
-    def begin_planning(self, job_id: str) -> bool:
-        """Move queued -> running. False if the job is no longer plannable (cancelled meanwhile)."""
+    def begin_planning(self, job_id: str, holder: str, *, ttl_s: float) -> int | None:
+        """Move queued -> running and give the planning fence.
 
-    def add_shards(self, job_id: str, shards: Iterable[ShardPlan]) -> None:
-        """Add planned shards with their videos; ordinals that exist are left as they are, so planning can be redone."""
+        None if there is nothing to plan (cancelled, failed or planned meanwhile) or another planner's time runs.
+        """
 
-    def finish_planning(self, job_id: str) -> None: ...
+    def renew_planning(self, job_id: str, fence: int, *, ttl_s: float) -> bool:
+        """Extend the planner's time; False if it is not this planner's job any more."""
 
-    def fail_job(self, job_id: str, code: str, message: str) -> None: ...
+    def add_shards(self, job_id: str, fence: int, shards: Iterable[ShardPlan], *, ttl_s: float) -> bool:
+        """Add planned shards with their videos and extend the planner's time.
+
+        Shards that are there already are left as they are. False, and nothing is added, if it is not this planner's
+        job any more: another one took it over, or it is cancelled, failed or planned.
+
+        Raises:
+            InvalidTransition: An ordinal is taken by a shard with other videos.
+        """
+
+    def finish_planning(self, job_id: str, fence: int) -> bool:
+        """Close the plan; False, and nothing changes, if it is not this planner's job any more."""
+
+    def fail_job(self, job_id: str, code: str, message: str, *, planning_fence: int | None = None) -> None:
+        """Any live state -> failed; its leases are stopped through their renewals. A job that has ended stays as it is.
+
+        Args:
+            planning_fence: Given by a planner: nothing happens if it is not its job any more.
+        """
 
     # Leases ---------------------------------------------------------------------------------------------------------
     def claim(self, holder: str, *, limit: int, ttl_s: float) -> list[Lease]:

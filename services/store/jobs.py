@@ -1,11 +1,10 @@
-"""Transitions of jobs: creation, planning, cancellation, the end."""
+"""Transitions of jobs: creation, cancellation, failure, the end."""
 
 from __future__ import annotations
 
 import hashlib
 import json
 import posixpath
-from collections.abc import Iterable
 from datetime import datetime, timedelta
 from typing import Any
 
@@ -14,10 +13,10 @@ from ulid import ULID
 
 from services.domain.errors import IdempotencyConflict, InvalidTransition, JobNotCancellable, JobNotFound, OutputInUse
 from services.domain.events import EventKind, job_event
-from services.domain.models import JobSpec, ShardPlan, shard_id
-from services.domain.states import JOB_TRANSITIONS, JobState, ShardState, VideoStatus
+from services.domain.models import JobSpec
+from services.domain.states import JOB_TRANSITIONS, JobState, ShardState
 from services.store.database import Tx
-from services.store.schema import idempotency_keys, in_state, jobs, shards, videos
+from services.store.schema import idempotency_keys, in_state, jobs, shards
 
 # Serialises the creation of jobs in PostgreSQL, so that ids grow and the check of the output cannot be overtaken.
 _CREATE_LOCK = 0x6A6F6273
@@ -134,85 +133,16 @@ def request_cancel(tx: Tx, job_id: str) -> None:
     settle_cancelling(tx, job_id)
 
 
-def begin_planning(tx: Tx, job_id: str) -> bool:
-    """See `Store.begin_planning`."""
-    job = lock_job(tx, job_id)
-    state = JobState(job.state)
-    if state is JobState.QUEUED:
-        move_job(tx, job, JobState.RUNNING, started_at=tx.now)
-        return True
-    return state is JobState.RUNNING and not job.planned
+def is_planned_by(job: Row[Any], fence: int) -> bool:
+    """Whether this planner's word counts. One whose time ran out, but whom nobody replaced, may go on."""
+    return JobState(job.state) is JobState.RUNNING and not job.planned and bool(job.planning_fence == fence)
 
 
-def add_shards(tx: Tx, job_id: str, plans: Iterable[ShardPlan]) -> None:
-    """See `Store.add_shards`. Adds nothing to a job that is not being planned any more."""
+def fail_job(tx: Tx, job_id: str, code: str, message: str, planning_fence: int | None = None) -> None:
+    """See `Store.fail_job`."""
     job = lock_job(tx, job_id)
-    if JobState(job.state) is not JobState.RUNNING or job.planned:
+    if planning_fence is not None and not is_planned_by(job, planning_fence):
         return
-    wanted = {plan.ordinal: plan for plan in plans}
-    known = set(
-        tx.run(select(shards.c.ordinal).where(shards.c.job_id == job_id, shards.c.ordinal.in_(list(wanted)))).scalars()
-    )
-    new = [plan for ordinal, plan in sorted(wanted.items()) if ordinal not in known]
-    if not new:
-        return
-    tx.run(
-        insert(shards),
-        [
-            {
-                "id": shard_id(job_id, plan.ordinal),
-                "job_id": job_id,
-                "ordinal": plan.ordinal,
-                "state": ShardState.PENDING.value,
-                "plan_hash": plan.plan_hash,
-                "num_videos": len(plan.videos),
-                "input_bytes": sum(v.size_bytes for v in plan.videos),
-            }
-            for plan in new
-        ],
-    )
-    tx.run(
-        insert(videos),
-        [
-            {
-                "job_id": job_id,
-                "key": video.key,
-                "shard_id": shard_id(job_id, plan.ordinal),
-                "position": position,
-                "uri": video.uri,
-                "size_bytes": video.size_bytes,
-                "etag": video.etag,
-                "status": VideoStatus.PENDING.value,
-            }
-            for plan in new
-            for position, video in enumerate(plan.videos)
-        ],
-    )
-    num_videos = sum(len(plan.videos) for plan in new)
-    tx.run(
-        update(jobs)
-        .where(jobs.c.id == job_id)
-        .values(
-            shards_total=jobs.c.shards_total + len(new),
-            videos_total=jobs.c.videos_total + num_videos,
-            updated_at=tx.now,
-        )
-    )
-    tx.emit(job_id, EventKind.SHARDS_PLANNED, shards=len(new), videos=num_videos)
-
-
-def finish_planning(tx: Tx, job_id: str) -> None:
-    """See `Store.finish_planning`. Nothing changes for a job that is not being planned any more."""
-    job = lock_job(tx, job_id)
-    if JobState(job.state) is not JobState.RUNNING or job.planned:
-        return
-    tx.run(update(jobs).where(jobs.c.id == job_id).values(planned=True, updated_at=tx.now))
-    tx.emit(job_id, EventKind.PLANNING_FINISHED, shards=job.shards_total, videos=job.videos_total)
-
-
-def fail_job(tx: Tx, job_id: str, code: str, message: str) -> None:
-    """See `Store.fail_job`. Leased shards are stopped through their renewals. A job that has ended stays as it is."""
-    job = lock_job(tx, job_id)
     if JobState.FAILED not in JOB_TRANSITIONS[JobState(job.state)]:
         return
     error = {"error_code": code, "error_message": message}

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from datetime import timedelta
+from datetime import datetime, timedelta
 from typing import Any
 
 from sqlalchemy import Row, Select, and_, func, or_, select
@@ -50,10 +50,12 @@ def first_job(tx: Tx, query: Select[Any]) -> Job | None:
     return None if row is None else _job(tx, row)
 
 
-def unplanned() -> Select[Any]:
-    return select(jobs).where(
-        or_(jobs.c.state == JobState.QUEUED.value, and_(jobs.c.state == JobState.RUNNING.value, ~jobs.c.planned))
+def unplanned(holder: str, now: datetime) -> Select[Any]:
+    free = or_(
+        jobs.c.planning_expires_at.is_(None), jobs.c.planning_expires_at <= now, jobs.c.planning_holder == holder
     )
+    open_plan = and_(jobs.c.state == JobState.RUNNING.value, ~jobs.c.planned, free)
+    return select(jobs).where(or_(jobs.c.state == JobState.QUEUED.value, open_plan))
 
 
 def finalizable() -> Select[Any]:

@@ -88,6 +88,10 @@ jobs = Table(
     Column("output", Text, nullable=False),
     Column("state", String(32), nullable=False),
     Column("planned", Boolean, nullable=False, server_default=text("false")),
+    # Who plans it, until when.
+    Column("planning_fence", BigInteger, nullable=False, server_default=text("0")),
+    Column("planning_holder", String(255)),
+    Column("planning_expires_at", UtcDateTime),
     Column("error_code", String(64)),
     Column("error_message", Text),
     Column("created_at", UtcDateTime, nullable=False),

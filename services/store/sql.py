@@ -1,4 +1,4 @@
-"""The store on SQLAlchemy: each method is one transaction of `jobs`, `leases` or `reading`."""
+"""The store on SQLAlchemy: each method is one transaction of `jobs`, `planning`, `leases` or `reading`."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from services.domain.models import (
     ShardPlan,
 )
 from services.domain.states import JobState, VideoStatus
-from services.store import jobs, leases, migrations, reading
+from services.store import jobs, leases, migrations, planning, reading
 from services.store.base import VideoRow
 from services.store.database import Database
 
@@ -64,21 +64,24 @@ class SqlStore:
         return self.get_job(job_id)
 
     # Planning -------------------------------------------------------------------------------------------------------
-    def next_unplanned(self) -> Job | None:
-        return self._db.read(lambda tx: reading.first_job(tx, reading.unplanned()))
+    def next_unplanned(self, holder: str) -> Job | None:
+        return self._db.read(lambda tx: reading.first_job(tx, reading.unplanned(holder, tx.now)))
 
-    def begin_planning(self, job_id: str) -> bool:
-        return self._db.write(lambda tx: jobs.begin_planning(tx, job_id))
+    def begin_planning(self, job_id: str, holder: str, *, ttl_s: float) -> int | None:
+        return self._db.write(lambda tx: planning.begin(tx, job_id, holder, ttl_s))
 
-    def add_shards(self, job_id: str, shards: Iterable[ShardPlan]) -> None:
+    def renew_planning(self, job_id: str, fence: int, *, ttl_s: float) -> bool:
+        return self._db.write(lambda tx: planning.renew(tx, job_id, fence, ttl_s))
+
+    def add_shards(self, job_id: str, fence: int, shards: Iterable[ShardPlan], *, ttl_s: float) -> bool:
         plans = list(shards)
-        self._db.write(lambda tx: jobs.add_shards(tx, job_id, plans))
+        return self._db.write(lambda tx: planning.add_shards(tx, job_id, fence, plans, ttl_s))
 
-    def finish_planning(self, job_id: str) -> None:
-        self._db.write(lambda tx: jobs.finish_planning(tx, job_id))
+    def finish_planning(self, job_id: str, fence: int) -> bool:
+        return self._db.write(lambda tx: planning.finish(tx, job_id, fence))
 
-    def fail_job(self, job_id: str, code: str, message: str) -> None:
-        self._db.write(lambda tx: jobs.fail_job(tx, job_id, code, message))
+    def fail_job(self, job_id: str, code: str, message: str, *, planning_fence: int | None = None) -> None:
+        self._db.write(lambda tx: jobs.fail_job(tx, job_id, code, message, planning_fence))
 
     # Leases ---------------------------------------------------------------------------------------------------------
     def claim(self, holder: str, *, limit: int, ttl_s: float) -> list[Lease]:

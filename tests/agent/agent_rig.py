@@ -147,9 +147,10 @@ class Rig:
             (str(inputs),), str(self.root / "out"), preset=preset, attributes=("pose", "intrinsics", "depth")
         )
         job, _ = self.store.create_job(spec)
-        assert self.store.begin_planning(job.id)
-        self.store.add_shards(job.id, [ShardPlan(0, tuple(videos))])
-        self.store.finish_planning(job.id)
+        fence = self.store.begin_planning(job.id, "planner", ttl_s=60)
+        assert fence is not None
+        self.store.add_shards(job.id, fence, [ShardPlan(0, tuple(videos))], ttl_s=60)
+        self.store.finish_planning(job.id, fence)
         return job.id
 
     def lease(self) -> LiveLease:

@@ -23,7 +23,7 @@ from services.domain.errors import StorageError, StoreUnavailable
 from services.domain.models import JobSpec
 from services.domain.states import JobState, ShardState
 from services.observability.metrics import Metrics
-from services.planner import plan
+from services.planner import plan_next
 from services.storage import open_store
 from services.store.sql import SqlStore
 
@@ -202,8 +202,7 @@ def test_leases_outlive_their_time_only_while_they_are_renewed(world: World) -> 
 
 def test_leases_of_a_dead_agent_are_taken_over(world: World) -> None:
     job_id = world.submit("orphan", {"a": "frames=3"})
-    assert world.store.begin_planning(job_id)
-    plan(world.store.get_job(job_id), world.store)
+    assert plan_next(world.store, "a dead agent")
     (lease,) = world.store.claim("a dead agent", limit=1, ttl_s=0.5)
     world.agent.start()
     assert world.ended(job_id) is JobState.SUCCEEDED

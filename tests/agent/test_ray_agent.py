@@ -56,15 +56,16 @@ def _submit(store: SqlStore, root: Path, *shards: dict[str, str]) -> str:
     job_id = store.create_job(JobSpec((str(inputs),), str(root / "out"), attributes=("pose", "intrinsics", "depth")))[
         0
     ].id
-    assert store.begin_planning(job_id)
+    fence = store.begin_planning(job_id, "planner", ttl_s=60)
+    assert fence is not None
     for ordinal, scripts in enumerate(shards):
         videos = []
         for name, script in scripts.items():
             path = inputs / f"{name}.mp4"
             path.write_text(script)
             videos.append(VideoRef(video_key(str(path)), str(path), len(script)))
-        store.add_shards(job_id, [ShardPlan(ordinal, tuple(videos))])
-    store.finish_planning(job_id)
+        store.add_shards(job_id, fence, [ShardPlan(ordinal, tuple(videos))], ttl_s=60)
+    store.finish_planning(job_id, fence)
     return job_id
 
 

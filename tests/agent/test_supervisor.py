@@ -63,7 +63,7 @@ def test_a_video_that_always_kills_is_tried_last_and_quarantined(rig: Rig) -> No
     assert "a-poison.mp4" in str(rows["a-poison"].error_message)
     assert rows["b"].status is rows["c"].status is VideoStatus.SUCCEEDED
     assert rig.slot.annotated() == ["a-poison", "b", "c", "a-poison", "a-poison"]
-    assert rig.metric("vipe_quarantined_videos") == 1
+    assert rig.metric("vipe_videos_total", outcome="quarantined", error_class="worker_died") == 1
 
 
 def test_deaths_of_an_earlier_lease_are_remembered(rig: Rig) -> None:

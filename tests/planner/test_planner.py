@@ -16,7 +16,7 @@ from moto.server import ThreadedMotoServer
 from services.domain.errors import InputUnavailable, StorageError
 from services.domain.models import JobSpec, VideoRef, video_key
 from services.domain.states import JobState
-from services.planner import plan_next
+from services.planner import Turn, plan_next
 from services.planner.listing import Found, expand
 from services.planner.packing import SeenVideos, new_videos, pack, shard_room
 from services.planner.planning import CLAIM_KEY
@@ -184,8 +184,8 @@ class TestJobs:
     def test_a_directory_becomes_shards(self, store: SqlStore, videos: Path, tmp_path: Path) -> None:
         make(videos, *(f"{i:02d}.mp4" for i in range(5)))
         job_id = submit(store, tmp_path / "out", videos, videos / "03.mp4", shard_max_videos=2)
-        assert plan_next(store)
-        assert not plan_next(store)
+        assert plan_next(store, "planner")
+        assert not plan_next(store, "planner")
         uris = [f"{videos}/{i:02d}.mp4" for i in range(5)]
         assert planned(store, job_id) == [(number, [uri]) for number, uri in enumerate(uris)]
         job = store.get_job(job_id)
@@ -199,7 +199,7 @@ class TestJobs:
         monkeypatch.setattr("services.planner.planning._BATCH_SHARDS", 2)
         make(videos, *(f"{i:02d}.mp4" for i in range(14)))
         undisturbed = submit(store, tmp_path / "a", videos, shard_max_videos=2)
-        assert plan_next(store)
+        assert plan_next(store, "planner")
 
         class Crash(Exception):
             pass
@@ -207,21 +207,71 @@ class TestJobs:
         class DyingStore(SqlStore):
             left = batches
 
-            def add_shards(self, job_id, shards):  # type: ignore[no-untyped-def]
+            def add_shards(self, job_id, fence, shards, *, ttl_s):  # type: ignore[no-untyped-def]
                 if self.left == 0:
                     raise Crash
                 self.left -= 1
-                super().add_shards(job_id, shards)
+                return super().add_shards(job_id, fence, shards, ttl_s=ttl_s)
 
         job_id = submit(store, tmp_path / "b", videos, shard_max_videos=2)
         dying = DyingStore(f"sqlite:///{tmp_path}/store.db")
         with pytest.raises(Crash):
-            plan_next(dying)
+            plan_next(dying, "dead planner", ttl_s=0)
         dying.close()
         assert len(planned(store, job_id)) == 2 * batches
-        assert plan_next(store)
+        assert plan_next(store, "planner")
         assert planned(store, job_id) == planned(store, undisturbed)
         assert store.get_job(job_id).planned
+
+    def test_two_agents_that_meet_in_one_job_lose_no_video(
+        self, store: SqlStore, videos: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        """The first sleeps through its time after its listing; the second has added half of the plan by then."""
+        monkeypatch.setattr("services.planner.planning._BATCH_SHARDS", 2)
+        make(videos, *(f"{i:02d}.mp4" for i in range(14)))
+        job_id = submit(store, tmp_path / "out", videos, shard_max_videos=2)
+
+        class Crash(Exception):
+            pass
+
+        class SecondStore(SqlStore):
+            left = 3
+
+            def add_shards(self, job_id, fence, shards, *, ttl_s):  # type: ignore[no-untyped-def]
+                if self.left == 0:
+                    raise Crash
+                self.left -= 1
+                return super().add_shards(job_id, fence, shards, ttl_s=ttl_s)
+
+        class SleepyStore(SqlStore):
+            def add_shards(self, job_id, fence, shards, *, ttl_s):  # type: ignore[no-untyped-def]
+                second = SecondStore(f"sqlite:///{tmp_path}/store.db")
+                with pytest.raises(Crash):
+                    plan_next(second, "second", ttl_s=60)
+                second.close()
+                (videos / "00a.mp4").write_bytes(b"xxxx")
+                return super().add_shards(job_id, fence, shards, ttl_s=ttl_s)
+
+        sleepy = SleepyStore(f"sqlite:///{tmp_path}/store.db")
+        assert plan_next(sleepy, "sleepy", ttl_s=0)
+        sleepy.close()
+        assert not store.get_job(job_id).planned
+        assert not plan_next(store, "third"), "the second one's time still runs"
+        assert plan_next(store, "second")
+        assert store.get_job(job_id).planned
+        uris = sorted(uri for _, shard in planned(store, job_id) for uri in shard)
+        assert uris == sorted(f"{videos}/{name}.mp4" for name in ["00a", *(f"{i:02d}" for i in range(14))])
+
+    def test_a_long_listing_keeps_the_turn(self, store: SqlStore, videos: Path, tmp_path: Path) -> None:
+        job_id = submit(store, tmp_path / "out", videos)
+        fence = store.begin_planning(job_id, "slow", ttl_s=0.0)
+        assert fence is not None
+        seconds = iter([0.0, 1.0, 25.0, 25.0])
+        turn = Turn(store, job_id, fence, ttl_s=60.0, clock=lambda: next(seconds))
+        kept = turn.keep("abc")
+        assert next(kept) == "a"
+        assert store.begin_planning(job_id, "slow", ttl_s=0.0) is not None, "a newer fence"
+        assert list(kept) == []
 
     def test_inputs_that_change_while_planning_is_down(
         self, store: SqlStore, videos: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -229,12 +279,13 @@ class TestJobs:
         """A video that appears before the ones already planned is added behind them; none is lost or doubled."""
         make(videos, "b.mp4", "c.mp4", "d.mp4")
         job_id = submit(store, tmp_path / "out", videos, shard_max_videos=2)
-        store.begin_planning(job_id)
+        fence = store.begin_planning(job_id, "dead planner", ttl_s=0)
+        assert fence is not None
         with SeenVideos() as seen:
             first = next(pack(new_videos(expand(str(videos)), seen), max_videos=2, max_input_bytes=100))
-        store.add_shards(job_id, [first])
+        store.add_shards(job_id, fence, [first], ttl_s=0)
         make(videos, "a.mp4")
-        assert plan_next(store)
+        assert plan_next(store, "planner")
         assert planned(store, job_id) == [
             (0, [f"{videos}/b.mp4"]),
             (1, [f"{videos}/a.mp4"]),
@@ -244,7 +295,7 @@ class TestJobs:
 
     def test_a_missing_input_fails_the_job_and_leaves_the_output_alone(self, store: SqlStore, tmp_path: Path) -> None:
         job_id = submit(store, tmp_path / "out", "/nowhere/clip.mp4")
-        assert plan_next(store)
+        assert plan_next(store, "planner")
         job = store.get_job(job_id)
         assert (job.state, job.error_code) == (JobState.FAILED, "input_unavailable")
         assert job.error_message is not None
@@ -255,7 +306,7 @@ class TestJobs:
         make(videos, "a.mp4")
         make(tmp_path / "out", CLAIM_KEY)
         job_id = submit(store, tmp_path / "out", videos)
-        assert plan_next(store)
+        assert plan_next(store, "planner")
         job = store.get_job(job_id)
         assert (job.state, job.error_code) == (JobState.FAILED, "output_in_use")
 
@@ -264,9 +315,9 @@ class TestJobs:
         make(tmp_path, "file")
         job_id = submit(store, tmp_path / "file" / "out", videos)
         with pytest.raises(StorageError):
-            plan_next(store)
+            plan_next(store, "planner")
         assert store.get_job(job_id).state is JobState.RUNNING
-        assert plan_next(store, give_up_after_s=0)
+        assert plan_next(store, "planner", give_up_after_s=0)
         assert store.get_job(job_id).error_code == "storage_error"
 
     def test_a_job_cancelled_while_it_is_planned(self, store: SqlStore, videos: Path, tmp_path: Path) -> None:
@@ -274,12 +325,12 @@ class TestJobs:
         job_id = submit(store, tmp_path / "out", videos)
 
         class CancellingStore(SqlStore):
-            def add_shards(self, job_id, shards):  # type: ignore[no-untyped-def]
+            def add_shards(self, job_id, fence, shards, *, ttl_s):  # type: ignore[no-untyped-def]
                 self.request_cancel(job_id)
-                super().add_shards(job_id, shards)
+                return super().add_shards(job_id, fence, shards, ttl_s=ttl_s)
 
         cancelling = CancellingStore(f"sqlite:///{tmp_path}/store.db")
-        assert plan_next(cancelling)
+        assert plan_next(cancelling, "planner")
         cancelling.close()
         assert store.get_job(job_id).state is JobState.CANCELLED
         assert planned(store, job_id) == []
@@ -325,7 +376,7 @@ class TestS3:
 
     def test_a_job_from_s3_to_s3(self, endpoint: str, bucket: str, store: SqlStore) -> None:
         job_id = submit(store, f"s3://{bucket}/out", f"s3://{bucket}/p/")
-        assert plan_next(store, s3_endpoint_url=endpoint)
+        assert plan_next(store, "planner", s3_endpoint_url=endpoint)
         assert [uris for _, uris in planned(store, job_id)] == [["s3://videos/p/a/c.mov"], ["s3://videos/p/b.mp4"]]
         claim = boto3.client("s3", endpoint_url=endpoint).get_object(Bucket=bucket, Key=f"out/{CLAIM_KEY}")
         assert job_id.encode() in claim["Body"].read()

@@ -18,11 +18,17 @@ def plans(number: int, videos_each: int = 2) -> list[ShardPlan]:
     ]
 
 
+def begin_planning(store: Store, job_id: str, holder: str = "planner", ttl_s: float = 60) -> int:
+    fence = store.begin_planning(job_id, holder, ttl_s=ttl_s)
+    assert fence is not None
+    return fence
+
+
 def planned_job(store: Store, number: int = 3, videos_each: int = 2, output: str = "/out") -> str:
     job, _ = store.create_job(spec(output))
-    assert store.begin_planning(job.id)
-    store.add_shards(job.id, plans(number, videos_each))
-    store.finish_planning(job.id)
+    fence = begin_planning(store, job.id)
+    assert store.add_shards(job.id, fence, plans(number, videos_each), ttl_s=60)
+    assert store.finish_planning(job.id, fence)
     return job.id
 
 

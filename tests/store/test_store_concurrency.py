@@ -10,10 +10,10 @@ from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 
-from store_helpers import planned_job, plans, record, spec
+from store_helpers import planned_job, record, spec
 
 from services.domain.events import EventKind
-from services.domain.models import Lease
+from services.domain.models import Lease, ShardPlan, VideoRef
 from services.domain.states import JobState
 from services.store.database import Database, Tx
 from services.store.sql import SqlStore
@@ -163,19 +163,32 @@ def test_one_owner_per_output_and_one_job_per_key(store: SqlStore) -> None:
     assert len(store.list_jobs()[0]) == 1
 
 
-def test_two_planners_write_one_plan(store: SqlStore) -> None:
+def test_two_planners_that_take_turns_lose_no_video(store: SqlStore) -> None:
+    """Each plans from what it finds, with a time so short that the other one takes over in the middle."""
     job, _ = store.create_job(spec())
-    store.begin_planning(job.id)
+    videos = [VideoRef(f"v{i:03}", f"/in/v{i:03}.mp4", 1) for i in range(60)]
 
-    def planner() -> None:
-        for i in range(0, 12, 3):
-            store.add_shards(job.id, plans(12)[i : i + 3])
-        store.finish_planning(job.id)
+    def planner(name: str) -> None:
+        while (fence := store.begin_planning(job.id, name, ttl_s=0.001)) is not None or not store.get_job(
+            job.id
+        ).planned:
+            if fence is None:
+                continue
+            first = store.get_job(job.id).progress.shards_total
+            rows, _ = store.list_videos(job.id, limit=1000)
+            there = {row.ref.key for row in rows}
+            left = [video for video in videos if video.key not in there]
+            for number in range(0, len(left), 3):
+                plan = ShardPlan(first + number // 3, tuple(left[number : number + 3]))
+                if not store.add_shards(job.id, fence, [plan], ttl_s=0.001):
+                    break
+            else:
+                store.finish_planning(job.id, fence)
 
-    at_once(planner, planner)
+    at_once(lambda: planner("a"), lambda: planner("b"))
     progress = store.get_job(job.id).progress
-    assert (progress.shards_total, progress.videos_total) == (12, 24)
-    assert [s.ordinal for s in store.list_shards(job.id)[0]] == list(range(12))
+    assert progress.videos_total == len(videos)
+    assert [s.ordinal for s in store.list_shards(job.id)[0]] == list(range(progress.shards_total))
 
 
 def test_cancelling_while_agents_claim(store: SqlStore) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pytest
-from store_helpers import planned_job, plans, record, spec
+from store_helpers import begin_planning, planned_job, plans, record, spec
 
 from services.domain.errors import (
     CommitConflict,
@@ -15,7 +15,7 @@ from services.domain.errors import (
     OutputInUse,
     ShardNotFound,
 )
-from services.domain.models import LeaseProgress
+from services.domain.models import LeaseProgress, ShardPlan, VideoRef
 from services.domain.states import JobState, ShardState, VideoStatus
 from services.store.sql import SqlStore
 
@@ -83,16 +83,16 @@ class TestJobs:
         assert [job.id for job in store.list_jobs(state=JobState.CANCELLED)[0]] == [ids[2]]
 
     def test_the_oldest_unplanned_job_comes_first(self, store: SqlStore) -> None:
-        assert store.next_unplanned() is None
+        assert store.next_unplanned("a") is None
         first, second = (store.create_job(spec(f"/out{i}"))[0].id for i in range(2))
-        assert store.begin_planning(first)
-        unplanned = store.next_unplanned()
+        begin_planning(store, first, "a")
+        unplanned = store.next_unplanned("a")
         assert unplanned is not None
         assert unplanned.id == first
-        assert store.begin_planning(first), "planning that was cut off begins again"
-        store.finish_planning(first)
-        assert not store.begin_planning(first)
-        unplanned = store.next_unplanned()
+        fence = begin_planning(store, first, "a")  # Planning that was cut off begins again.
+        assert store.finish_planning(first, fence)
+        assert store.begin_planning(first, "a", ttl_s=60) is None
+        unplanned = store.next_unplanned("a")
         assert unplanned is not None
         assert unplanned.id == second
 
@@ -100,11 +100,11 @@ class TestJobs:
 class TestPlanning:
     def test_shards_are_added_once(self, store: SqlStore) -> None:
         job, _ = store.create_job(spec())
-        store.begin_planning(job.id)
-        store.add_shards(job.id, plans(2))
-        store.add_shards(job.id, plans(3))
-        store.finish_planning(job.id)
-        store.add_shards(job.id, plans(9))
+        fence = begin_planning(store, job.id)
+        assert store.add_shards(job.id, fence, plans(2), ttl_s=60)
+        assert store.add_shards(job.id, fence, plans(3), ttl_s=60)
+        assert store.finish_planning(job.id, fence)
+        assert not store.add_shards(job.id, fence, plans(9), ttl_s=60)
         progress = store.get_job(job.id).progress
         assert (progress.shards_total, progress.videos_total) == (3, 6)
         assert kinds(store, job.id) == [
@@ -130,12 +130,45 @@ class TestPlanning:
 
     def test_a_job_cancelled_meanwhile_is_not_planned(self, store: SqlStore) -> None:
         job, _ = store.create_job(spec())
-        store.begin_planning(job.id)
+        fence = begin_planning(store, job.id)
         assert store.request_cancel(job.id).state is JobState.CANCELLED
-        store.add_shards(job.id, plans(2))
-        store.finish_planning(job.id)
-        assert not store.begin_planning(job.id)
+        assert not store.add_shards(job.id, fence, plans(2), ttl_s=60)
+        assert not store.renew_planning(job.id, fence, ttl_s=60)
+        assert not store.finish_planning(job.id, fence)
+        assert store.begin_planning(job.id, "planner", ttl_s=60) is None
         assert store.list_shards(job.id) == ([], None)
+
+    def test_one_planner_at_a_time(self, store: SqlStore) -> None:
+        job, _ = store.create_job(spec())
+        begin_planning(store, job.id, "a")
+        assert store.next_unplanned("b") is None
+        assert store.begin_planning(job.id, "b", ttl_s=60) is None
+        ours = store.next_unplanned("a")
+        assert ours is not None
+        assert ours.id == job.id
+
+    def test_a_planner_that_was_replaced_has_no_say(self, store: SqlStore) -> None:
+        job, _ = store.create_job(spec())
+        slow = begin_planning(store, job.id, "slow", ttl_s=0)
+        assert store.add_shards(job.id, slow, plans(1), ttl_s=0), "nobody replaced it yet"
+        fast = begin_planning(store, job.id, "fast")
+        other = ShardPlan(1, (VideoRef("late", "/in/late.mp4", 1),))
+        assert not store.add_shards(job.id, slow, [other], ttl_s=60)
+        assert not store.renew_planning(job.id, slow, ttl_s=60)
+        assert not store.finish_planning(job.id, slow)
+        store.fail_job(job.id, "input_unavailable", "out of date", planning_fence=slow)
+        assert store.add_shards(job.id, fast, plans(2), ttl_s=60)
+        assert store.finish_planning(job.id, fast)
+        job = store.get_job(job.id)
+        assert (job.state, job.progress.videos_total) == (JobState.RUNNING, 4)
+
+    def test_a_shard_never_takes_the_place_of_another(self, store: SqlStore) -> None:
+        job, _ = store.create_job(spec())
+        fence = begin_planning(store, job.id)
+        store.add_shards(job.id, fence, plans(1), ttl_s=60)
+        other = ShardPlan(0, (VideoRef("late", "/in/late.mp4", 1),))
+        with pytest.raises(InvalidTransition, match="shard 0"):
+            store.add_shards(job.id, fence, [other], ttl_s=60)
 
     def test_failing_a_job(self, store: SqlStore) -> None:
         job_id = planned_job(store, 2)
@@ -323,8 +356,7 @@ class TestCommit:
 
     def test_an_unplanned_job_is_not_finalised(self, store: SqlStore) -> None:
         job, _ = store.create_job(spec())
-        store.begin_planning(job.id)
-        store.add_shards(job.id, plans(1))
+        store.add_shards(job.id, begin_planning(store, job.id), plans(1), ttl_s=60)
         (lease,) = store.claim("a", limit=1, ttl_s=60)
         store.record_commit(record(lease))
         assert store.next_finalizable() is None
