@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Iterable, Mapping
-from pathlib import PurePosixPath
 from typing import Any
 
 from rich.console import Console
@@ -47,7 +46,7 @@ def annotation_table(
         table.add_column("FOV err", justify="right", no_wrap=True)
     table.add_column("reliable")
     for row in rows:
-        name = row.get("name") or PurePosixPath(row["uri"]).name
+        name = str(row.get("name") or row["key"])
         if row.get("error_code"):
             blanks = [""] * (7 + (2 if scores else 0))
             table.add_row(name, *blanks, Text(f"{row['status']}: {row['error_code']}", style="red"))
@@ -66,7 +65,7 @@ def annotation_table(
             f"{row['trajectory_length']:.2f}{unit}",
         ]
         if scores:
-            score = scores.get(row["key"])
+            score = scores.get(name)
             cells += ["-", "-"] if score is None else [f"{score['ate_pct']:.2f}%", f"{score['fov_err_deg']:.2f}°"]
         table.add_row(*cells, _quality(row.get("quality")))
     return table
