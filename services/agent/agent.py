@@ -159,8 +159,8 @@ class Agent:
         next_expiry_s = next_counts_s = 0.0
         while not self._stopping.is_set():
             now = time.monotonic()
-            self._recover_executor()
             try:
+                self._recover_executor()
                 if now >= next_expiry_s:
                     next_expiry_s = now + self._config.lease_ttl_s / 3
                     expired = self._store.expire_leases()
@@ -206,26 +206,36 @@ class Agent:
         supervisor = Supervisor(handle, self._store, self._committer, self._give_backs, self._config, self._metrics)
         backoff = self._new_backoff()
         while not self._stopping.is_set():
-            if not supervisor.start():
-                self._enter(number, SlotState.LOST if backoff.failures else SlotState.STARTING)
-                self._stopping.wait(backoff.failed())
-                continue
-            backoff.succeeded()
-            self._enter(number, SlotState.IDLE)
             try:
-                live = self._work.get(timeout=0.5)
-            except queue.Empty:
-                continue
-            self._enter(number, SlotState.BUSY)
-            outcome = supervisor.work(live)
-            self._leases.drop(live)
-            self._after(outcome)
-            if outcome.fenced:
-                supervisor.stop()
-                self._enter(number, SlotState.FENCED)
-                self._stopping.wait(self._config.fence_cooloff_s)
-                supervisor.pardon()
+                self._tend_once(number, supervisor, backoff)
+            except Exception:
+                # A slot that lost its thread would be gone for good, and nobody would notice.
+                logger.exception("slot %d stumbled and goes on", number)
+                self._stopping.wait(backoff.failed())
         supervisor.stop()
+
+    def _tend_once(self, number: int, supervisor: Supervisor, backoff: Backoff) -> None:
+        if not supervisor.start():
+            self._enter(number, SlotState.LOST if backoff.failures else SlotState.STARTING)
+            self._stopping.wait(backoff.failed())
+            return
+        backoff.succeeded()
+        self._enter(number, SlotState.IDLE)
+        try:
+            live = self._work.get(timeout=0.5)
+        except queue.Empty:
+            return
+        self._enter(number, SlotState.BUSY)
+        try:
+            outcome = supervisor.work(live)
+        finally:
+            self._leases.drop(live)  # Or it would be renewed for ever, with nobody working on it.
+        self._after(outcome)
+        if outcome.fenced:
+            supervisor.stop()
+            self._enter(number, SlotState.FENCED)
+            self._stopping.wait(self._config.fence_cooloff_s)
+            supervisor.pardon()
 
     def _after(self, outcome: ShardOutcome) -> None:
         """Claim the next shard at once, or later where something does not work."""
@@ -238,12 +248,20 @@ class Agent:
     def _renew(self) -> None:
         # Beyond `stopping`: slots that are still giving back must not lose their leases meanwhile.
         while not self._drained.wait(self._config.lease_ttl_s / 3):
-            self._leases.renew()
+            try:
+                self._leases.renew()
+            except Exception:
+                logger.exception("renewing the leases failed")
 
     def _keep_jobs(self) -> None:
         self._jobs.reconcile()
         while not self._stopping.is_set():
-            if self._jobs.step():
+            try:
+                busy = self._jobs.step()
+            except Exception:
+                logger.exception("looking after the jobs failed")
+                busy = False
+            if busy:
                 self._wake.set()
             else:
                 self._stopping.wait(self._config.poll_s)

@@ -10,6 +10,14 @@ import threading
 from collections import Counter
 from collections.abc import Callable
 
+# Beyond any `max_s`, and far from where a float overflows: an outage may last for thousands of failures.
+_MAX_DOUBLINGS = 64
+
+
+def exponential_s(failures: int, base_s: float, max_s: float) -> float:
+    """`base_s`, doubled for each failure before, `max_s` at most."""
+    return min(max_s, base_s * 2.0 ** min(failures, _MAX_DOUBLINGS))
+
 
 class Backoff:
     """Delays that double with each failure.
@@ -31,7 +39,7 @@ class Backoff:
 
     def failed(self) -> float:
         """Count a failure and return how long to wait, at least a tenth of the ceiling."""
-        ceiling = min(self._max_s, self._base_s * 2.0**self._failures)
+        ceiling = exponential_s(self._failures, self._base_s, self._max_s)
         self._failures += 1
         return self._uniform(ceiling / 10, ceiling)
 

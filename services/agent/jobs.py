@@ -101,11 +101,11 @@ class JobKeeper:
         return True
 
     def _finalise_job(self, job: Job) -> None:
-        from services.dataset import finalise  # Slow to import; see `services.agent.commits`.
-
         backoff = self._finalising.setdefault(job.id, self._backoff())
         started = self._clock()
         try:
+            from services.dataset import finalise  # Slow to import; see `services.agent.commits`.
+
             scratch = self._config.scratch_dir / "finalise"
             scratch.mkdir(parents=True, exist_ok=True)
             finalise(

@@ -1,9 +1,9 @@
 """Plan a job: take its output, list its inputs, write its shards.
 
 One planner at a time: the store gives it a fence and refuses whoever holds an older one. Shards are written in their
-order, a batch per transaction, and each batch renews the planner's time. Planning that was cut off goes on behind the last shard that
-is there and leaves out every video that has a place already: unchanged inputs then give the plan that an undisturbed
-run gives, and inputs that changed meanwhile lose no video and double none.
+order, a batch per transaction, and each batch renews the planner's time. Planning that was cut off goes on behind the
+last shard that is there and leaves out every video that has a place already: unchanged inputs then give the plan that
+an undisturbed run gives, and inputs that changed meanwhile lose no video and double none.
 """
 
 from __future__ import annotations

@@ -13,11 +13,14 @@ from agent_rig import Rig
 
 import services.dataset
 from services.agent.agent import Agent
+from services.agent.backoff import Backoff
 from services.agent.config import AgentConfig
 from services.agent.executor import Died, SlotHandle
+from services.agent.jobs import JobKeeper
 from services.agent.leases import LeaseBook, LiveLease, StopReason
 from services.agent.messages import Reply, SlotProgress, Task
 from services.agent.slot import Slot, SlotConfig
+from services.agent.supervisor import Supervisor
 from services.commit.reconcile import committed_records
 from services.domain.errors import StorageError, StoreUnavailable
 from services.domain.models import JobSpec
@@ -251,6 +254,35 @@ def test_an_index_that_cannot_be_written_yet_is_written_later(world: World, monk
     world.agent.start()
     assert world.ended(job_id) is JobState.SUCCEEDED
     assert world.metric("vipe_stage_duration_seconds_count", stage="finalise") == 1
+
+
+def test_ten_thousand_failures_in_a_row_are_waited_out() -> None:
+    backoff = Backoff(1.0, 60.0, uniform=lambda low, high: high)
+    waits = [backoff.failed() for _ in range(10_000)]
+    assert waits[:7] == [1, 2, 4, 8, 16, 32, 60]
+    assert set(waits[6:]) == {60}
+
+
+def test_a_thread_that_stumbles_goes_on(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whatever raises where nobody expects it: the slot, the jobs and the leases are still looked after."""
+    stumbles: Counter[str] = Counter()
+
+    def stumbling(name: str, original: Callable[..., object]) -> Callable[..., object]:
+        def call(*args: object) -> object:
+            if stumbles[name] < 2:
+                stumbles[name] += 1
+                raise OverflowError("a defect")
+            return original(*args)
+
+        return call
+
+    monkeypatch.setattr(Supervisor, "work", stumbling("work", Supervisor.work))
+    monkeypatch.setattr(JobKeeper, "step", stumbling("step", JobKeeper.step))
+    monkeypatch.setattr(LeaseBook, "renew", stumbling("renew", LeaseBook.renew))
+    job_id = world.submit("job", {"a": "frames=3"})
+    world.agent.start()
+    assert world.ended(job_id) is JobState.SUCCEEDED
+    world.wait(lambda: stumbles == {"work": 2, "step": 2, "renew": 2}, "all to have stumbled")
 
 
 # The book of leases -------------------------------------------------------------------------------------------------
