@@ -81,8 +81,11 @@ class _Ended(Exception):
         self.outcome = outcome
 
 
+@dataclass(frozen=True, slots=True)
 class _TimedOut:
     """The task in flight went over its wall budget and was killed."""
+
+    budget_s: float
 
 
 class Supervisor:
@@ -126,9 +129,7 @@ class Supervisor:
                 outcome = ended.outcome
             except Exception as error:
                 logger.exception("work on %s failed", lease.shard_id)
-                code = error.code if isinstance(error, ServiceError) else "internal_error"
-                storage = isinstance(error, ServiceError) and error.retryable
-                outcome = ShardOutcome("given_back", code, str(error), storage_failed=storage)
+                outcome = self._unforeseen(lease, error)
             live.close()
             self._let_go(lease, outcome)
             return outcome
@@ -163,7 +164,7 @@ class Supervisor:
 
     def _shard(self, live: LiveLease) -> ShardOutcome:
         lease = live.lease
-        if lease.attempt > 1 and self._committer.settled(lease):
+        if lease.attempt > 1 and self._persist(lambda: self._committer.settled(lease)):
             return ShardOutcome("committed", "found in the output")
         deaths = dict(lease.spent)
         results: dict[str, VideoResult] = self._opened(live, {})
@@ -230,8 +231,8 @@ class Supervisor:
                             raise self._given_back(live, answer)
                     case Failed():
                         raise self._given_back(live, answer)
-                    case _TimedOut():
-                        message = f"{video.uri}: no result within {self._budget_s(video):.0f} s; the worker was killed"
+                    case _TimedOut(budget_s):
+                        message = f"{video.uri}: no result within {budget_s:.0f} s; the worker was killed"
                         results[video.key] = failed_row(video, lease.attempt, VIDEO_TIMEOUT, message)
                         self._replace(results, self._opened(live, results))
                     case Died():
@@ -314,11 +315,11 @@ class Supervisor:
                 if now - stop_since > self._config.cancel_grace_s:
                     self.stop()
                     raise _Ended(ShardOutcome("stopped", live.stop_reason))
-            elif now - started > budget_s():
+            elif now - started > (allowed_s := budget_s()):
                 self._metrics.actor_restarts.labels(reason=VIDEO_TIMEOUT).inc()
-                logger.error("%s went over its budget of %.0f s and is killed", type(task).__name__, budget_s())
+                logger.error("%s went over its budget of %.0f s and is killed", type(task).__name__, allowed_s)
                 self.stop()
-                return _TimedOut()
+                return _TimedOut(allowed_s)  # The budget depends on the progress, which goes with the process.
 
     def _restart(self, live: LiveLease) -> None:
         backoff = self._backoff()
@@ -385,6 +386,15 @@ class Supervisor:
         storage_failed = failed.scope == "storage"
         return _Ended(ShardOutcome("given_back", failed.code, failed.message, storage_failed=storage_failed))
 
+    def _unforeseen(self, lease: Lease, error: Exception) -> ShardOutcome:
+        """How a lease ends whose work failed outside of every task: not for ever in the same way."""
+        if isinstance(error, ServiceError):
+            kind: Literal["given_back", "job_failed"] = "given_back" if error.retryable else "job_failed"
+            return ShardOutcome(kind, error.code, str(error))
+        kind = "job_failed" if self._give_backs.exhausted(lease.shard_id) else "given_back"
+        first_line = next(iter(str(error).splitlines()), "no message")
+        return ShardOutcome(kind, "internal_error", f"{lease.shard_id}: {type(error).__name__}: {first_line}")
+
     def _let_go(self, lease: Lease, outcome: ShardOutcome) -> None:
         """Settle a lease that is not worked on any more. What the store does not hear now, expiry repairs later."""
         logger.info("%s: %s %s %s", lease.shard_id, outcome.kind, outcome.reason, outcome.message)
@@ -406,8 +416,12 @@ class Supervisor:
         """Remove the scratch of a lease, if there is a process that can; otherwise the next sweep does."""
         if not self._alive:
             return
-        self._handle.submit(DiscardShard(lease))
-        outcome = self._handle.poll(self._config.start_timeout_s)
+        try:
+            self._handle.submit(DiscardShard(lease))
+            outcome = self._handle.poll(self._config.start_timeout_s)
+        except Exception as error:
+            logger.warning("could not remove the scratch of %s: %s", lease.shard_id, error)
+            outcome = None
         if outcome is None or isinstance(outcome, Died):
             self.stop()
 

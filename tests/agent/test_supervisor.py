@@ -8,8 +8,9 @@ import pytest
 from agent_rig import Rig
 
 from services.agent.leases import StopReason
-from services.agent.messages import AnnotateVideo, PackShard
-from services.domain.errors import StorageError, StorageRefused
+from services.agent.messages import AnnotateVideo, PackShard, SlotProgress
+from services.domain.errors import CommitConflict, IntegrityError, ServiceError, StorageError, StorageRefused
+from services.domain.models import Lease
 from services.domain.states import JobState, ShardState, VideoStatus
 from services.storage import open_store
 
@@ -249,6 +250,50 @@ def test_an_input_that_can_never_be_fetched_becomes_a_row_in_the_end(
     assert outcomes == ["given_back", "given_back", "committed"]
     (row,) = rig.rows(live).values()
     assert (row.status, row.error_code) == (VideoStatus.FAILED, "input_unavailable")
+
+
+@pytest.mark.parametrize("error", [StorageRefused, IntegrityError, CommitConflict])
+def test_an_output_that_refuses_a_second_attempt_fails_the_job(
+    rig: Rig, monkeypatch: pytest.MonkeyPatch, error: type[ServiceError]
+) -> None:
+    job_id = rig.job({"a": "frames=3"})
+    first = rig.lease()
+    rig.store.release(first.lease.shard_id, first.lease.fence, "restart")
+
+    def gone(lease: Lease) -> bool:
+        raise error("the bucket was deleted")
+
+    monkeypatch.setattr(rig.committer, "settled", gone)
+    assert rig.supervisor.work(rig.lease()).kind == "job_failed"
+    job = rig.store.get_job(job_id)
+    assert (job.state, job.error_code) == (JobState.FAILED, error.code)
+
+
+def test_a_defect_of_the_service_does_not_give_a_shard_back_for_ever(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rig = Rig.make(tmp_path, max_give_backs=2)
+    job_id = rig.job({"a": "frames=3"})
+
+    def defect(*_: object) -> None:
+        raise ZeroDivisionError("a defect")
+
+    monkeypatch.setattr(rig.slot, "poll", defect)
+    monkeypatch.setattr(rig.slot, "submit", lambda task: None)
+    assert [rig.supervisor.work(rig.lease()).kind for _ in range(3)] == ["given_back", "given_back", "job_failed"]
+    assert rig.store.get_job(job_id).error_code == "internal_error"
+
+
+def test_a_timeout_names_the_budget_that_was_spent(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The frames that the budget counts are forgotten when the worker is killed."""
+    rig.job({"a": "hang"})
+    live = rig.lease()
+    monkeypatch.setattr(
+        rig.slot, "progress", lambda: SlotProgress(frames_expected=100 if rig.slot._slot is not None else None)
+    )
+    rig.supervisor.work(live)
+    spent_s = rig.config.video_budget_base_s + 100 * rig.config.video_budget_per_frame_s
+    assert f"within {spent_s:.0f} s" in str(rig.rows(live)["a"].error_message)
 
 
 def test_an_output_that_refuses_fails_the_job_in_the_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
