@@ -124,12 +124,13 @@ class LeaseBook:
     def renew(self) -> None:
         """Renew every lease in one call and pass on what the store says. Never raises."""
         entries = [entry for entry in self.all() if not entry.closed]
-        reports = [entry.report() for entry in entries]
-        self._metrics.frames_in_progress.set(sum(report.frames_done for report in reports))
         if not entries:
+            self._metrics.frames_in_progress.set(0)
             return
         asked_s = self._clock()
         try:
+            reports = [entry.report() for entry in entries]
+            self._metrics.frames_in_progress.set(sum(report.frames_done for report in reports))
             renewals = self._store.renew(self._holder, reports, ttl_s=self._ttl_s)
         except Exception as error:
             self._metrics.lease_renew_failures.inc()

@@ -15,6 +15,7 @@ from services.api import problems, routes
 from services.api.middleware import BodyLimit, LoopbackHost, RequestContext, is_loopback
 from services.api.problems import Problem, Unauthorized
 from services.api.schemas import Readiness, Status
+from services.domain.errors import StoreUnavailable
 from services.observability.metrics import CONTENT_TYPE, Metrics, package_version
 from services.settings import Settings
 from services.store.base import Store
@@ -93,9 +94,12 @@ def readyz(request: Request) -> Readiness:
 
 @_operations.get("/metrics", response_class=Response, responses={200: {"content": {"text/plain": {}}}})
 def metrics(request: Request) -> Response:
-    """Prometheus metrics."""
+    """Prometheus metrics, without the store's counts while it does not answer."""
     page: Metrics = request.app.state.metrics
-    page.set_counts(request.app.state.store.counts())
+    try:
+        page.set_counts(request.app.state.store.counts())
+    except StoreUnavailable:
+        page.store_is_down()
     return Response(page.render(), media_type=CONTENT_TYPE)
 
 

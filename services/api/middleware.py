@@ -72,12 +72,16 @@ class RequestContext:
         request_id = given if _ACCEPTABLE_ID.fullmatch(given) else uuid.uuid4().hex
         scope.setdefault("state", {})["request_id"] = request_id
         status = 0
+        answered_s: float | None = None  # A stream lives as long as its job; what it took to answer is its start.
 
         async def send_with_id(message: Message) -> None:
-            nonlocal status
+            nonlocal status, answered_s
             if message["type"] == "http.response.start":
                 status = message["status"]
-                MutableHeaders(scope=message)[_ID_HEADER] = request_id
+                headers = MutableHeaders(scope=message)
+                headers[_ID_HEADER] = request_id
+                if headers.get("content-type", "").startswith("text/event-stream"):
+                    answered_s = time.perf_counter() - start
             await send(message)
 
         start = time.perf_counter()
@@ -95,7 +99,7 @@ class RequestContext:
                 route = getattr(scope.get("route"), "path", "unmatched")
                 method = scope["method"] if scope["method"] in _METHODS else "other"
                 self._metrics.api_request_duration.labels(route=route, method=method, status=str(status)).observe(
-                    elapsed_s
+                    elapsed_s if answered_s is None else answered_s
                 )
                 _log.info("%s %s %d in %.0f ms", scope["method"], scope["path"], status, 1e3 * elapsed_s)
 

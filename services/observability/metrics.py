@@ -7,6 +7,7 @@ and the agent share it, so that one `/metrics` page tells everything.
 
 from __future__ import annotations
 
+import math
 import platform
 from collections.abc import Mapping
 from importlib.metadata import PackageNotFoundError, version
@@ -23,8 +24,10 @@ from prometheus_client import (
     start_http_server,
 )
 
+from services.domain.errors import InputUnavailable
 from services.domain.models import VideoResult
 from services.domain.states import JobState, ShardState, VideoStatus
+from vipe_core import errors as engine_errors
 
 if TYPE_CHECKING:
     from threading import Thread
@@ -35,6 +38,21 @@ CONTENT_TYPE = CONTENT_TYPE_LATEST
 
 _STAGE_BUCKETS_S = (0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0, 20.0, 40.0, 80.0, 160.0, 320.0, 640.0, 1280.0)
 _REQUEST_BUCKETS_S = (0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0)
+
+WORKER_DIED = "worker_died"
+
+
+def _engine_codes() -> set[str]:
+    """The code of every error in the engine's taxonomy."""
+    return {
+        kind.code
+        for kind in vars(engine_errors).values()
+        if isinstance(kind, type) and issubclass(kind, engine_errors.VipeError)
+    }
+
+
+FAILURE_CODES = tuple(sorted(_engine_codes() | {"video_timeout", InputUnavailable.code}))
+"""What a video can fail with: the engine's codes, and those that the service adds to them."""
 
 
 class Metrics:
@@ -53,6 +71,12 @@ class Metrics:
         # The store's view. Every process that reports them reports the same value: aggregate with max, not sum.
         self.jobs = Gauge("vipe_jobs", "Jobs in the store by state.", ["state"], registry=registry)
         self.shards = Gauge("vipe_shards", "Shards in the store by state.", ["state"], registry=registry)
+        self.store_up = Gauge(
+            "vipe_store_up",
+            "Whether the store answered this process the last time it was asked; NaN before the first time.",
+            registry=registry,
+        )
+        self.store_up.set(math.nan)
 
         # Work done by this process.
         self.videos = Counter(
@@ -61,17 +85,17 @@ class Metrics:
             ["outcome", "error_class"],
             registry=registry,
         )
+        self.frames_in_progress = Gauge(
+            "vipe_frames_in_progress",
+            "Frames that count as done in the shards that this process holds; as long as it changes, work goes on.",
+            registry=registry,
+        )
         self.frames = Counter("vipe_frames_total", "Annotated frames in committed shards.", registry=registry)
         self.stage_duration = Histogram(
             "vipe_stage_duration_seconds",
             "Wall time of a stage: fetch and the engine's own per video; pack and commit per shard; finalise per job.",
             ["stage"],
             buckets=_STAGE_BUCKETS_S,
-            registry=registry,
-        )
-        self.quarantined_videos = Gauge(
-            "vipe_quarantined_videos",
-            "Videos quarantined by this process because they kept killing the worker.",
             registry=registry,
         )
 
@@ -130,19 +154,36 @@ class Metrics:
             "vipe_build_info", "Always 1; the labels tell what runs.", ["version", "python"], registry=registry
         )
         self.build_info.labels(version=package_version(), python=platform.python_version()).set(1)
+        self._begin_at_zero()
+
+    def _begin_at_zero(self) -> None:
+        """Create the known children of counters: a series that begins at 1 shows no increase, so its first is lost."""
+        self.videos.labels(outcome=VideoStatus.SUCCEEDED.value, error_class="")
+        self.videos.labels(outcome=VideoStatus.QUARANTINED.value, error_class=WORKER_DIED)
+        for code in FAILURE_CODES:
+            self.videos.labels(outcome=VideoStatus.FAILED.value, error_class=code)
+        for reason in ("died", "video_timeout", "start_failed"):
+            self.actor_restarts.labels(reason=reason)
+        for result in ("adopted", "lost_lease", "conflict"):
+            self.commit_conflicts.labels(result=result)
 
     def set_counts(self, counts: Mapping[str, Mapping[str, int]]) -> None:
         """Publish `Store.counts()`; a state that the store does not mention is 0, not stale."""
+        self.store_up.set(1)
         for job_state in JobState:
             self.jobs.labels(state=job_state.value).set(counts.get("jobs", {}).get(job_state.value, 0))
         for shard_state in ShardState:
             self.shards.labels(state=shard_state.value).set(counts.get("shards", {}).get(shard_state.value, 0))
 
+    def store_is_down(self) -> None:
+        """Publish that the store does not answer: its counts are unknown, not what they were."""
+        self.store_up.set(0)
+        self.jobs.clear()
+        self.shards.clear()
+
     def observe_video(self, result: VideoResult) -> None:
         """Count one video of a shard that this process committed."""
         self.videos.labels(outcome=result.status.value, error_class=result.error_code or "").inc()
-        if result.status is VideoStatus.QUARANTINED:
-            self.quarantined_videos.inc()
         if result.num_frames and result.status is VideoStatus.SUCCEEDED:
             self.frames.inc(result.num_frames)
         for stage, seconds in (result.timings_s or {}).items():

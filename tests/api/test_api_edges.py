@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import threading
 import time
@@ -15,9 +16,12 @@ from conftest import Service, running
 from fastapi import FastAPI
 from openapi_spec_validator import validate
 from pydantic import SecretStr
+from starlette.types import Message, Receive, Scope, Send
 
 from services.api import create_app, create_server, problems
+from services.api.middleware import RequestContext
 from services.domain import errors
+from services.observability.metrics import Metrics
 from services.settings import Settings
 from services.store.sql import SqlStore
 
@@ -135,6 +139,52 @@ def test_a_defect_is_a_problem_too(tmp_path: Path) -> None:
         assert_problem(answer, 503, "store_unavailable")
         assert answer.headers["retry-after"]
     store.close()
+
+
+def test_metrics_without_a_store(tmp_path: Path) -> None:
+    class UnreachableStore(SqlStore):
+        def counts(self) -> dict[str, dict[str, int]]:
+            raise errors.StoreUnavailable("the database does not answer; try again")
+
+    store = UnreachableStore(f"sqlite:///{tmp_path}/store.db")
+    with serving(create_app(store, Settings(port=0))) as url:
+        assert httpx.get(f"{url}/healthz").status_code == 200
+        answer = httpx.get(f"{url}/metrics")
+    store.close()
+    assert answer.status_code == 200
+    assert "vipe_store_up 0.0" in answer.text
+    assert 'route="/healthz"' in answer.text
+    assert "vipe_jobs{" not in answer.text
+
+
+@pytest.mark.parametrize(
+    ("content_type", "seconds"), [("text/event-stream; charset=utf-8", 2.0), ("text/plain", 3602.0)]
+)
+def test_the_duration_of_a_stream_is_the_time_to_its_start(
+    content_type: str, seconds: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    now_s = 100.0
+    monkeypatch.setattr("services.api.middleware.time.perf_counter", lambda: now_s)
+
+    async def app(scope: Scope, receive: Receive, send: Send) -> None:
+        nonlocal now_s
+        now_s += 2.0
+        headers = [(b"content-type", content_type.encode())]
+        await send({"type": "http.response.start", "status": 200, "headers": headers})
+        now_s += 3600.0
+        await send({"type": "http.response.body", "body": b""})
+
+    async def receive() -> Message:
+        return {"type": "http.disconnect"}
+
+    async def send(message: Message) -> None:
+        pass
+
+    metrics = Metrics()
+    scope = {"type": "http", "method": "GET", "path": "/x", "headers": []}
+    asyncio.run(RequestContext(app, metrics=metrics)(scope, receive, send))
+    labels = {"route": "unmatched", "method": "GET", "status": "200"}
+    assert metrics.registry.get_sample_value("vipe_api_request_duration_seconds_sum", labels) == seconds
 
 
 @contextlib.contextmanager

@@ -68,6 +68,21 @@ def test_dashboard_and_alerts_use_only_exported_metrics() -> None:
     assert used <= exported, f"not exported by the service: {sorted(used - exported)}"
 
 
+def test_alerts_and_totals_hold_where_series_are_missing_or_start_again() -> None:
+    rules = {rule["alert"]: rule["expr"] for rule in alert_rules()}
+    stalled = rules["VipeNoProgress"]
+    assert stalled.count("or vector(0)") == stalled.count("== 0") == 2, (
+        "no agent, no series: that is no progress either"
+    )
+    assert "vipe_frames_in_progress" in stalled, "a long shard settles no video for hours"
+    counters = {name for name in exported_series() if name.startswith("vipe_") and name.endswith("_total")}
+    for expr in expressions():
+        for name in counters & set(re.findall(r"\bvipe_[a-z_]+", expr)):
+            bare = re.findall(rf"(\w+)\({name}(?:{{[^}}]*}})?(\[)?", expr)
+            assert bare, expr
+            assert all(call in ("rate", "increase") and window for call, window in bare), expr
+
+
 def test_dashboard_labels_exist() -> None:
     labels = {label for family in Metrics().registry.collect() for label in family_labels(family.name)}
     for expr in expressions():
