@@ -21,6 +21,7 @@ from services.agent.executor import Executor, SlotHandle
 from services.agent.jobs import JobKeeper
 from services.agent.leases import LeaseBook, LiveLease, StopReason
 from services.agent.supervisor import ShardOutcome, Supervisor
+from services.domain.errors import StoreUnavailable
 from services.observability.metrics import Metrics
 from services.store.base import Store
 
@@ -238,8 +239,11 @@ class Agent:
             supervisor.pardon()
 
     def _after(self, outcome: ShardOutcome) -> None:
-        """Claim the next shard at once, or later where something does not work."""
-        if outcome.kind == "given_back":
+        """Claim the next shard at once, or later where the database does not answer.
+
+        Whatever else is wrong is that shard's matter: it waits, and others have their turn.
+        """
+        if outcome.kind == "given_back" and outcome.reason == StoreUnavailable.code:
             self._claim_after_s = time.monotonic() + self._claims.failed()
         elif outcome.kind == "committed":
             self._claims.succeeded()

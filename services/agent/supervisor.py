@@ -18,7 +18,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Literal, TypeVar
 
-from services.agent.backoff import Backoff, GiveBacks
+from services.agent.backoff import Backoff, GiveBacks, exponential_s
 from services.agent.commits import Committer
 from services.agent.config import AgentConfig
 from services.agent.executor import Died, SlotHandle
@@ -62,14 +62,12 @@ class ShardOutcome:
     Attributes:
         kind: `committed`, also by somebody else; `stopped` by the live lease's stop reason; `given_back` for another
             attempt; `job_failed`: no attempt at any shard of this job can succeed.
-        storage_failed: Given back because storage did not answer; others should wait, too.
         fenced: The slot must not be used for a while.
     """
 
     kind: Literal["committed", "stopped", "given_back", "job_failed"]
     reason: str = ""
     message: str = ""
-    storage_failed: bool = False
     fenced: bool = False
 
 
@@ -278,7 +276,7 @@ class Supervisor:
                     raise _Ended(ShardOutcome("job_failed", error.code, str(error))) from error
                 delay_s = backoff.failed()
                 if backoff.failures >= self._config.storage_tries:
-                    raise _Ended(ShardOutcome("given_back", error.code, str(error), storage_failed=True)) from error
+                    raise _Ended(ShardOutcome("given_back", error.code, str(error))) from error
                 logger.warning("could not commit, next try in %.1f s: %s", delay_s, error)
                 self._sleep(delay_s)
 
@@ -383,8 +381,7 @@ class Supervisor:
         exhausted = failed.scope == "shard" and self._give_backs.exhausted(live.lease.shard_id)
         if failed.scope == "job" or exhausted:
             return _Ended(ShardOutcome("job_failed", failed.code, failed.message))
-        storage_failed = failed.scope == "storage"
-        return _Ended(ShardOutcome("given_back", failed.code, failed.message, storage_failed=storage_failed))
+        return _Ended(ShardOutcome("given_back", failed.code, failed.message))
 
     def _unforeseen(self, lease: Lease, error: Exception) -> ShardOutcome:
         """How a lease ends whose work failed outside of every task: not for ever in the same way."""
@@ -406,11 +403,17 @@ class Supervisor:
             if outcome.kind == "job_failed":
                 self._store.fail_job(lease.job_id, outcome.reason, outcome.message)
             if outcome.kind != "committed" and outcome.reason != StopReason.LOST:
-                self._store.release(lease.shard_id, lease.fence, outcome.reason)
+                self._store.release(lease.shard_id, lease.fence, outcome.reason, wait_s=self._wait_s(lease, outcome))
         except Exception as error:
             logger.warning("could not give %s back, its lease will run out: %s", lease.shard_id, error)
         if outcome.kind in ("committed", "job_failed") or outcome.reason in (StopReason.LOST, StopReason.CANCELLED):
             self._discard(lease)
+
+    def _wait_s(self, lease: Lease, outcome: ShardOutcome) -> float:
+        """How long a shard that was given back rests; what was only stopped can go on at once."""
+        if outcome.kind != "given_back":
+            return 0.0
+        return exponential_s(lease.attempt - 1, self._config.backoff_base_s, self._config.backoff_max_s)
 
     def _discard(self, lease: Lease) -> None:
         """Remove the scratch of a lease, if there is a process that can; otherwise the next sweep does."""

@@ -96,7 +96,11 @@ class Store(Protocol):
 
     # Leases ---------------------------------------------------------------------------------------------------------
     def claim(self, holder: str, *, limit: int, ttl_s: float) -> list[Lease]:
-        """Lease pending shards, oldest job first. Fence and attempt grow by one with each lease of a shard."""
+        """Lease pending shards. Fence and attempt grow by one with each lease of a shard.
+
+        Oldest job first, but those with shards that wait after a release come after all others: what is wrong with
+        them must not keep everybody's slots busy.
+        """
 
     def renew(self, holder: str, progress: Sequence[LeaseProgress], *, ttl_s: float) -> list[Renewal]:
         """Extend leases in bulk and learn which to stop."""
@@ -110,8 +114,12 @@ class Store(Protocol):
         A lease that is not current any more has no say: nothing is counted then.
         """
 
-    def release(self, shard_id: str, fence: int, reason: str) -> None:
-        """Give a lease back: the shard is pending again (or cancelled, if its job is being cancelled)."""
+    def release(self, shard_id: str, fence: int, reason: str, *, wait_s: float = 0.0) -> None:
+        """Give a lease back: the shard is pending again (or cancelled, if its job is being cancelled).
+
+        Args:
+            wait_s: For how long nobody may lease it.
+        """
 
     def record_commit(self, record: CommitRecord) -> bool:
         """Mark a shard committed from its record. Idempotent; False if it was committed already.

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from datetime import timedelta
 from typing import Any
 
-from sqlalchemy import Row, bindparam, exists, select, update
+from sqlalchemy import Row, bindparam, exists, or_, select, update
 
 from services.domain.errors import CommitConflict, ShardNotFound
 from services.domain.events import EventKind
@@ -30,6 +30,7 @@ from services.store.jobs import lock_job, settle_cancelling
 from services.store.schema import in_state, jobs, shards, videos
 
 _NO_LEASE: dict[str, Any] = {
+    "not_before": None,
     "holder": None,
     "lease_expires_at": None,
     "video_key": None,
@@ -98,21 +99,23 @@ def claim(tx: Tx, holder: str, limit: int, ttl_s: float) -> list[Lease]:
 
 
 def _lock_claimable(tx: Tx, limit: int) -> list[str]:
-    """Pending shards of running jobs, oldest job first, those that another claim holds left out.
+    """Pending shards of running jobs, those that wait and those that another claim holds left out.
 
-    Job by job, so that each query reads `limit` entries of an index instead of sorting all that is pending.
+    Jobs with shards that wait come last, else the oldest is first. Job by job, so that each query reads `limit` entries
+    of an index instead of sorting all that is pending.
     """
     pending = in_state(shards.c.state, ShardState.PENDING)
+    ready = or_(shards.c.not_before.is_(None), shards.c.not_before <= tx.now)
     with_work = (
         select(jobs.c.id)
         .where(jobs.c.state == JobState.RUNNING.value, exists().where(shards.c.job_id == jobs.c.id, pending))
-        .order_by(jobs.c.id)
+        .order_by(exists().where(shards.c.job_id == jobs.c.id, pending, shards.c.not_before > tx.now), jobs.c.id)
     )
     chosen: list[str] = []
     for job_id in tx.run(with_work).scalars().all():
         free = (
             select(shards.c.id)
-            .where(shards.c.job_id == job_id, pending)
+            .where(shards.c.job_id == job_id, pending, ready)
             .order_by(shards.c.ordinal)
             .limit(limit - len(chosen))
             .with_for_update(skip_locked=True)
@@ -193,11 +196,11 @@ def blame(tx: Tx, shard: str, fence: int, video_key: str, reason: str) -> int:
     return deaths
 
 
-def release(tx: Tx, shard: str, fence: int, reason: str) -> None:
+def release(tx: Tx, shard: str, fence: int, reason: str, wait_s: float) -> None:
     """See `Store.release`. Nothing happens for a lease that is not current any more."""
     row = _lock_shard(tx, shard)
     if _is_current(row, fence):
-        _end_lease(tx, row, EventKind.SHARD_RELEASED, reason=reason)
+        _end_lease(tx, row, EventKind.SHARD_RELEASED, wait_s, reason=reason)
         settle_cancelling(tx, row.job_id)
 
 
@@ -308,11 +311,14 @@ def _lock_shard(tx: Tx, shard: str) -> Row[Any]:
     return tx.run(select(shards).where(shards.c.id == shard).with_for_update()).one()
 
 
-def _end_lease(tx: Tx, row: Row[Any], kind: EventKind, **data: Any) -> None:
+def _end_lease(tx: Tx, row: Row[Any], kind: EventKind, wait_s: float = 0.0, **data: Any) -> None:
     """Pending again, or cancelled where the job takes no more leases."""
     job_state = JobState(tx.run(select(jobs.c.state).where(jobs.c.id == row.job_id)).scalar_one())
     to = ShardState.PENDING if job_state is JobState.RUNNING else ShardState.CANCELLED
-    tx.run(update(shards).where(shards.c.id == row.id).values(**_NO_LEASE, state=to.value))
+    changes = {**_NO_LEASE, "state": to.value}
+    if wait_s > 0:
+        changes["not_before"] = tx.now + timedelta(seconds=wait_s)
+    tx.run(update(shards).where(shards.c.id == row.id).values(**changes))
     tx.emit(row.job_id, kind, shard_id=row.id, holder=row.holder, fence=row.fence, **data)
 
 

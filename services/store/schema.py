@@ -145,6 +145,7 @@ shards = Table(
     Column("leased_at", UtcDateTime),
     Column("renewed_at", UtcDateTime),
     Column("lease_expires_at", UtcDateTime),
+    Column("not_before", UtcDateTime),  # a shard that was given back waits until then
     Column("video_key", String(128)),
     Column("stage", String(64)),
     _count("videos_done"),
@@ -162,6 +163,13 @@ shards = Table(
         "committed_at",
         sqlite_where=text("state = 'committed'"),
         postgresql_where=text("state = 'committed'"),
+    ),
+    Index(
+        "ix_shards_waiting",
+        "job_id",
+        "not_before",
+        sqlite_where=text("state = 'pending'"),
+        postgresql_where=text("state = 'pending'"),
     ),
     Index(
         "ix_shards_expiring",

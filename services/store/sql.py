@@ -96,8 +96,8 @@ class SqlStore:
     def blame(self, shard_id: str, fence: int, video_key: str, reason: str) -> int:
         return self._db.write(lambda tx: leases.blame(tx, shard_id, fence, video_key, reason))
 
-    def release(self, shard_id: str, fence: int, reason: str) -> None:
-        self._db.write(lambda tx: leases.release(tx, shard_id, fence, reason))
+    def release(self, shard_id: str, fence: int, reason: str, *, wait_s: float = 0.0) -> None:
+        self._db.write(lambda tx: leases.release(tx, shard_id, fence, reason, wait_s))
 
     def record_commit(self, record: CommitRecord) -> bool:
         return self._db.write(lambda tx: leases.record_commit(tx, record))

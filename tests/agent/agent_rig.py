@@ -110,6 +110,7 @@ class Rig:
 
     @classmethod
     def make(cls, root: Path, **settings: object) -> Rig:
+        settings.setdefault("backoff_base_s", 0.0)  # A shard that was given back can be leased again at once.
         config = AgentConfig(
             scratch_dir=root / "scratch",
             engine="agent_engines:open_in_memory",

@@ -21,9 +21,10 @@ from services.agent.leases import LeaseBook, LiveLease, StopReason
 from services.agent.messages import Reply, SlotProgress, Task
 from services.agent.slot import Slot, SlotConfig
 from services.agent.supervisor import Supervisor
+from services.commit.protocol import CommitOutcome, PreparedPayload
 from services.commit.reconcile import committed_records
 from services.domain.errors import StorageError, StoreUnavailable
-from services.domain.models import JobSpec
+from services.domain.models import JobSpec, Lease
 from services.domain.states import JobState, ShardState
 from services.observability.metrics import Metrics
 from services.planner import plan_next
@@ -170,6 +171,28 @@ def test_jobs_run_side_by_side_and_a_bad_one_harms_nobody(world: World) -> None:
     assert world.agent.ready
     world.wait(lambda: world.metric("vipe_actors", role="slot", state="idle") == 2, "both slots to be idle")
     assert world.store.get_job(blocked).state is not JobState.SUCCEEDED
+
+
+def test_a_job_whose_output_is_down_keeps_no_slot_from_the_others(
+    world: World, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The older job has more shards than there are slots, and every one of them comes back."""
+    broken = world.submit("broken", {f"v{n}": "frames=2" for n in range(12)}, shard_max_videos=1)
+    original = world.agent._committer.write
+
+    def write(lease: Lease, payload: PreparedPayload) -> CommitOutcome:
+        if lease.job_id == broken:
+            raise StorageError("the output does not answer")
+        return original(lease, payload)
+
+    monkeypatch.setattr(world.agent._committer, "write", write)
+    world.agent.start()
+    world.wait(
+        lambda: any(e.kind == "shard.released" for e in world.store.events(broken)), "the first shard to be given back"
+    )
+    good = world.submit("good", {f"v{n}": "frames=2" for n in range(6)}, shard_max_videos=1)
+    assert world.ended(good) is JobState.SUCCEEDED
+    assert world.store.get_job(broken).state is JobState.RUNNING
 
 
 def test_cancelling_stops_the_work_and_frees_the_slot(world: World) -> None:

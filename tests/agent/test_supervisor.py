@@ -223,7 +223,7 @@ def test_unreachable_output_gives_the_lease_back_and_then_goes_on(rig: Rig, monk
     with monkeypatch.context() as patch:
         patch.setattr(rig.committer, "write", down)
         outcome = rig.supervisor.work(live)
-    assert (outcome.kind, outcome.storage_failed) == ("given_back", True)
+    assert (outcome.kind, outcome.reason) == ("given_back", "storage_error")
     assert _shard_state(rig, job_id) is ShardState.PENDING
     again = rig.lease()
     assert rig.supervisor.work(again).kind == "committed"

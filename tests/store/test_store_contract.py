@@ -186,6 +186,17 @@ class TestPlanning:
 
 
 class TestLeases:
+    def test_what_was_given_back_waits_and_its_job_comes_last(self, store: SqlStore) -> None:
+        troubled, good = planned_job(store, 3, output="/a"), planned_job(store, 2, output="/b")
+        (lease,) = store.claim("a", limit=1, ttl_s=60)
+        store.release(lease.shard_id, lease.fence, "storage_error", wait_s=600)
+        got = store.claim("a", limit=9, ttl_s=60)
+        assert [(g.job_id, g.ordinal) for g in got] == [(troubled, 1), (troubled, 2), (good, 0), (good, 1)]
+        for other in got:
+            store.release(other.shard_id, other.fence, "drained")
+        (first,) = store.claim("a", limit=1, ttl_s=60)
+        assert first.job_id == good
+
     def test_a_lease_carries_the_plan(self, store: SqlStore) -> None:
         job_id = planned_job(store, 2)
         (lease,) = store.claim("a", limit=1, ttl_s=60)

@@ -96,6 +96,7 @@ def upgrade() -> None:
         sa.Column("leased_at", _TIME, nullable=True),
         sa.Column("renewed_at", _TIME, nullable=True),
         sa.Column("lease_expires_at", _TIME, nullable=True),
+        sa.Column("not_before", _TIME, nullable=True),
         sa.Column("video_key", sa.String(length=128), nullable=True),
         sa.Column("stage", sa.String(length=64), nullable=True),
         sa.Column("videos_done", sa.BigInteger(), server_default=sa.text("0"), nullable=False),
@@ -121,6 +122,13 @@ def upgrade() -> None:
         ["lease_expires_at"],
         sqlite_where=sa.text("state = 'leased'"),
         postgresql_where=sa.text("state = 'leased'"),
+    )
+    op.create_index(
+        "ix_shards_waiting",
+        "shards",
+        ["job_id", "not_before"],
+        sqlite_where=sa.text("state = 'pending'"),
+        postgresql_where=sa.text("state = 'pending'"),
     )
     op.create_index("ix_shards_job_id_state_ordinal", "shards", ["job_id", "state", "ordinal"])
 
