@@ -9,7 +9,7 @@ from collections.abc import Callable
 from services.agent.backoff import Backoff
 from services.agent.commits import Committer
 from services.agent.config import AgentConfig
-from services.domain.errors import ServiceError
+from services.domain.errors import ServiceError, code_and_message
 from services.domain.models import Job
 from services.domain.states import JobState
 from services.observability.logging import context
@@ -40,8 +40,6 @@ class JobKeeper:
         self._clock = clock
         self._planning = self._backoff()
         self._plan_after_s = 0.0
-        self._finalising: dict[str, Backoff] = {}
-        self._finalise_after_s = 0.0
 
     def step(self) -> bool:
         """Plan a job and finalise a job, where there is one; whether anything was done. Never raises."""
@@ -76,6 +74,8 @@ class JobKeeper:
                 ttl_s=self._config.lease_ttl_s,
                 input_roots=self._config.input_roots,
                 s3_endpoint_url=self._config.s3_endpoint_url,
+                backoff_base_s=self._config.backoff_base_s,
+                backoff_max_s=self._config.backoff_max_s,
             )
         except Exception as error:
             delay_s = self._planning.failed()
@@ -87,8 +87,6 @@ class JobKeeper:
         return busy
 
     def _finalise(self) -> bool:
-        if self._clock() < self._finalise_after_s:
-            return False
         try:
             job = self._store.next_finalizable()
         except Exception as error:
@@ -97,11 +95,9 @@ class JobKeeper:
         if job is None:
             return False
         with context(job=job.id):
-            self._finalise_job(job)
-        return True
+            return self._finalise_job(job)
 
-    def _finalise_job(self, job: Job) -> None:
-        backoff = self._finalising.setdefault(job.id, self._backoff())
+    def _finalise_job(self, job: Job) -> bool:
         started = self._clock()
         try:
             from services.dataset import finalise  # Slow to import; see `services.agent.commits`.
@@ -118,25 +114,30 @@ class JobKeeper:
             )
             done = self._store.finish_job(job.id)
         except Exception as error:
-            typed = isinstance(error, ServiceError)
-            delay_s = backoff.failed()
-            if backoff.failures < _FINALISE_TRIES and (not isinstance(error, ServiceError) or error.retryable):
-                self._finalise_after_s = self._clock() + delay_s
-                logger.warning("could not finalise, next try in %.1f s: %s", delay_s, error, exc_info=not typed)
-                return
-            logger.error("cannot be finalised: %s", error, exc_info=not typed)
-            self._fail(job, error)
+            self._not_finalised(job, error)
+            return False
         else:
             self._metrics.stage_duration.labels(stage="finalise").observe(self._clock() - started)
             logger.info("%s: %s", job.id, done.state.value)
-        self._finalising.pop(job.id, None)
+            return True
 
-    def _fail(self, job: Job, error: Exception) -> None:
-        code = error.code if isinstance(error, ServiceError) else "internal_error"
+    def _not_finalised(self, job: Job, error: Exception) -> None:
+        """Later, or never; meanwhile the other jobs have their turn."""
+        foreseen = isinstance(error, ServiceError)
         try:
-            self._store.fail_job(job.id, code, str(error).splitlines()[0] if str(error) else type(error).__name__)
+            if not isinstance(error, ServiceError) or error.retryable:
+                deferral = self._store.defer_job(
+                    job.id, base_s=self._config.backoff_base_s, max_s=self._config.backoff_max_s
+                )
+                if deferral.failures < _FINALISE_TRIES:
+                    logger.warning(
+                        "could not finalise, next try in %.1f s: %s", deferral.wait_s, error, exc_info=not foreseen
+                    )
+                    return
+            logger.error("cannot be finalised: %s", error, exc_info=not foreseen)
+            self._store.fail_job(job.id, *code_and_message(error))
         except Exception as second:
-            logger.warning("could not mark the job as failed: %s", second)
+            logger.warning("could not say that finalising failed: %s", second)
 
     def _backoff(self) -> Backoff:
         return Backoff(self._config.backoff_base_s, self._config.backoff_max_s)

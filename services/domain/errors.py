@@ -120,3 +120,9 @@ class IntegrityError(ServiceError):
     """Stored bytes do not match their record."""
 
     code = "integrity_error"
+
+
+def code_and_message(error: Exception) -> tuple[str, str]:
+    """What a failed job says: a code and one line."""
+    code = error.code if isinstance(error, ServiceError) else "internal_error"
+    return code, next(iter(str(error).splitlines()), type(error).__name__)

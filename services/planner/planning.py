@@ -14,11 +14,10 @@ import logging
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import TypeVar
 
-from services.domain.errors import OutputInUse, OutputUnsupported, ServiceError
+from services.domain.errors import OutputInUse, OutputUnsupported, ServiceError, StoreUnavailable, code_and_message
 from services.domain.models import Job, ShardPlan
 from services.planner.listing import Found, expand
 from services.planner.packing import SeenVideos, new_videos, pack
@@ -42,6 +41,8 @@ def plan_next(
     input_roots: Sequence[Path] = (),
     s3_endpoint_url: str | None = None,
     give_up_after_s: float = 120.0,
+    backoff_base_s: float = 1.0,
+    backoff_max_s: float = 60.0,
 ) -> bool:
     """Plan the oldest job that needs it. A job that cannot be planned fails with the reason.
 
@@ -51,13 +52,15 @@ def plan_next(
         ttl_s: Another planner takes over what nothing was heard of for so long.
         input_roots: Where local inputs must lie; empty: anywhere.
         s3_endpoint_url: S3 service other than AWS.
-        give_up_after_s: For how long storage that does not answer is asked again.
+        give_up_after_s: For how long a job is tried again whose planning fails for reasons that can pass, storage that
+            does not answer or a defect. It waits meanwhile, and other jobs have their turn.
+        backoff_base_s, backoff_max_s: Its first wait, which doubles, and the longest one.
 
     Returns:
         Whether there was one.
 
     Raises:
-        ServiceError: Something that can pass: call again later.
+        StoreUnavailable: The database does not answer: call again later.
     """
     job = store.next_unplanned(holder)
     if job is None:
@@ -68,12 +71,23 @@ def plan_next(
     turn = Turn(store, job.id, fence, ttl_s)
     try:
         plan(turn, input_roots=input_roots, s3_endpoint_url=s3_endpoint_url)
-    except ServiceError as error:
-        since = (datetime.now(UTC) - (job.started_at or datetime.now(UTC))).total_seconds()
-        if error.retryable and since < give_up_after_s:
-            raise
-        _log.warning("job %s cannot be planned: %s", job.id, error)
-        store.fail_job(job.id, error.code, str(error), planning_fence=fence)
+    except StoreUnavailable:
+        raise
+    except Exception as error:
+        foreseen = isinstance(error, ServiceError)
+        if not isinstance(error, ServiceError) or error.retryable:
+            deferral = store.defer_job(job.id, base_s=backoff_base_s, max_s=backoff_max_s, planning_fence=fence)
+            if deferral.failing_s < give_up_after_s:
+                _log.warning(
+                    "planning of job %s failed, next try in %.1f s: %s",
+                    job.id,
+                    deferral.wait_s,
+                    error,
+                    exc_info=not foreseen,
+                )
+                return True
+        _log.error("job %s cannot be planned: %s", job.id, error, exc_info=not foreseen)
+        store.fail_job(job.id, *code_and_message(error), planning_fence=fence)
     return True
 
 

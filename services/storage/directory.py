@@ -11,12 +11,15 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import BinaryIO, cast
 
-from services.domain.errors import ObjectMissing, StorageError
+from services.domain.errors import ObjectMissing, StorageError, StorageRefused
 from services.storage.base import ObjectInfo
 from services.storage.keys import TEMPORARY_PREFIX, check_key
 from services.storage.observer import SilentObserver, StorageObserver
 
 _COPY_CHUNK_BYTES = 4 << 20
+
+# What no waiting changes.
+_REFUSALS = {errno.EACCES, errno.EPERM, errno.EROFS, errno.ENAMETOOLONG, errno.ENOTDIR, errno.ELOOP, errno.EINVAL}
 
 
 class DirectoryStore:
@@ -26,14 +29,14 @@ class DirectoryStore:
     in one step: a rename for `put_*`, a hard link for `create` (a link fails if the name is taken, so it decides
     between two writers as S3's `If-None-Match: *` does). A crash leaves a hidden file, never half an object.
 
-    Unlike S3, a file system cannot hold both an object `a` and an object `a/b`; the second raises `StorageError`.
+    Unlike S3, a file system cannot hold both an object `a` and an object `a/b`; the second raises `StorageRefused`.
     """
 
     def __init__(self, root: str | Path, *, observer: StorageObserver | None = None) -> None:
         self._root = Path(root)
         if not self._root.is_absolute():
-            raise StorageError(f"the directory {str(root)!r} must be an absolute path")
-        self._real_root = self._root.resolve()
+            raise StorageRefused(f"the directory {str(root)!r} must be an absolute path")
+        self._real_root = Path(os.path.realpath(self._root))
         self._observer: StorageObserver = observer or SilentObserver()
 
     @property
@@ -144,8 +147,8 @@ class DirectoryStore:
     def _path(self, key: str) -> Path:
         """The file of a key; a symbolic link on the way must not lead out of the root."""
         path = self._root / check_key(key)
-        if not path.resolve().is_relative_to(self._real_root):
-            raise StorageError(f"{self._root}/{key} leads out of the store through a symbolic link")
+        if not Path(os.path.realpath(path)).is_relative_to(self._real_root):
+            raise StorageRefused(f"{self._root}/{key} leads out of the store through a symbolic link")
         return path
 
     def _info(self, key: str, path: Path) -> ObjectInfo | None:
@@ -196,13 +199,14 @@ class DirectoryStore:
             self._observer.request(op, "404" if op == "get" else "error")
             if op == "get":
                 raise ObjectMissing(f"{self._root}/{key} does not exist") from error
-            raise StorageError(f"{self._root}/{key} collides with another object that is a folder or a file") from error
+            raise StorageRefused(
+                f"{self._root}/{key} collides with another object that is a folder or a file"
+            ) from error
         except OSError as error:
             self._observer.request(op, "error")
             reason = errno.errorcode.get(error.errno or 0, "unknown error")
-            raise StorageError(
-                f"{op} of {self._root}/{key} failed: {os.strerror(error.errno or 0)} ({reason})"
-            ) from error
+            kind = StorageRefused if error.errno in _REFUSALS else StorageError
+            raise kind(f"{op} of {self._root}/{key} failed: {os.strerror(error.errno or 0)} ({reason})") from error
 
 
 def _make_folder(folder: Path) -> None:

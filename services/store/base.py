@@ -36,6 +36,21 @@ class VideoRow:
     result: VideoResult | None
 
 
+@dataclass(frozen=True, slots=True)
+class Deferral:
+    """Why patience with a job may end.
+
+    Attributes:
+        failures: In a row, this one included.
+        failing_s: Since the first of them.
+        wait_s: Until the job's next turn.
+    """
+
+    failures: int
+    failing_s: float
+    wait_s: float
+
+
 class Store(Protocol):
     # Jobs -----------------------------------------------------------------------------------------------------------
     def create_job(
@@ -45,7 +60,8 @@ class Store(Protocol):
 
         Raises:
             IdempotencyConflict: The key was used with another spec.
-            OutputInUse: A job that is not failed or cancelled has the same output.
+            OutputInUse: An earlier job has the same output. An output stays with its first job for ever; only a job
+                that failed or was cancelled before it had shards frees it.
         """
 
     def get_job(self, job_id: str) -> Job:
@@ -63,12 +79,14 @@ class Store(Protocol):
     # One planner at a time plans a job. Its fence grows with every `begin_planning`; what comes with a smaller one is
     # refused, so a planner that slept through the end of its time can neither leave a gap nor close the plan over one.
     def next_unplanned(self, holder: str) -> Job | None:
-        """The oldest job that is queued, or running with planning unfinished, and that no other live planner holds."""
+        """The oldest job that is queued, or running with planning unfinished, that does not wait and that no other live
+        planner holds."""
 
     def begin_planning(self, job_id: str, holder: str, *, ttl_s: float) -> int | None:
         """Move queued -> running and give the planning fence.
 
-        None if there is nothing to plan (cancelled, failed or planned meanwhile) or another planner's time runs.
+        None if there is nothing to plan (cancelled, failed or planned meanwhile), if another planner's time runs, or if
+        the job waits.
         """
 
     def renew_planning(self, job_id: str, fence: int, *, ttl_s: float) -> bool:
@@ -92,6 +110,15 @@ class Store(Protocol):
 
         Args:
             planning_fence: Given by a planner: nothing happens if it is not its job any more.
+        """
+
+    def defer_job(self, job_id: str, *, base_s: float, max_s: float, planning_fence: int | None = None) -> Deferral:
+        """Count a failure to move the job along; planning and finalising leave it out for a while.
+
+        The wait is `base_s`, doubled for each failure in a row, `max_s` at most. A planner's turn ends.
+
+        Args:
+            planning_fence: See `fail_job`.
         """
 
     # Leases ---------------------------------------------------------------------------------------------------------
@@ -135,7 +162,10 @@ class Store(Protocol):
 
     # Finalising -----------------------------------------------------------------------------------------------------
     def next_finalizable(self) -> Job | None:
-        """A planned running job whose shards are all settled (moved to finalizing), or one already finalizing."""
+        """A planned running job whose shards are all settled (moved to finalizing), or one already finalizing.
+
+        Jobs that wait are left out.
+        """
 
     def finish_job(self, job_id: str) -> Job:
         """Finalizing -> succeeded, or succeeded_with_errors if any video failed."""

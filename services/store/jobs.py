@@ -8,18 +8,26 @@ import posixpath
 from datetime import datetime, timedelta
 from typing import Any
 
-from sqlalchemy import Row, func, insert, select, update
+from sqlalchemy import Row, and_, func, insert, select, update
 from ulid import ULID
 
 from services.domain.errors import IdempotencyConflict, InvalidTransition, JobNotCancellable, JobNotFound, OutputInUse
 from services.domain.events import EventKind, job_event
 from services.domain.models import JobSpec
 from services.domain.states import JOB_TRANSITIONS, JobState, ShardState
+from services.store.base import Deferral
 from services.store.database import Tx
 from services.store.schema import idempotency_keys, in_state, jobs, shards
 
 # Serialises the creation of jobs in PostgreSQL, so that ids grow and the check of the output cannot be overtaken.
 _CREATE_LOCK = 0x6A6F6273
+
+
+# What a job looks like that moves along.
+NO_FAILURES: dict[str, Any] = {"failures": 0, "failing_since": None, "not_before": None}
+
+# Beyond any wait that somebody asks for, and far from where a float overflows.
+_MAX_DOUBLINGS = 64
 
 
 def lock_job(tx: Tx, job_id: str) -> Row[Any]:
@@ -39,7 +47,7 @@ def move_job(tx: Tx, job: Row[Any], to: JobState, *, event_data: dict[str, Any] 
     if to not in JOB_TRANSITIONS[JobState(job.state)]:
         raise InvalidTransition(f"job {job.id} is {job.state}: it cannot become {to.value}")
     if to.terminal:
-        columns["finished_at"] = tx.now
+        columns.update(finished_at=tx.now, **NO_FAILURES)
     tx.run(update(jobs).where(jobs.c.id == job.id).values(state=to.value, updated_at=tx.now, **columns))
     tx.emit(job.id, job_event(to), **(event_data or {}))
 
@@ -81,13 +89,13 @@ def create_job(tx: Tx, spec: JobSpec, tenant: str, idempotency_key: str | None) 
                 )
             return known.job_id, False
     output = canonical_output(spec.output)
-    owner = tx.first(
-        select(jobs.c.id, jobs.c.state).where(
-            jobs.c.output == output, jobs.c.state.not_in([JobState.FAILED, JobState.CANCELLED])
-        )
-    )
+    ended_without_a_trace = and_(jobs.c.state.in_([JobState.FAILED, JobState.CANCELLED]), jobs.c.shards_total == 0)
+    owner = tx.first(select(jobs.c.id, jobs.c.state).where(jobs.c.output == output, ~ended_without_a_trace))
     if owner is not None:
-        raise OutputInUse(f"output {spec.output!r} belongs to job {owner.id} ({owner.state}); choose another output")
+        raise OutputInUse(
+            f"output {spec.output!r} belongs to job {owner.id} ({owner.state}), "
+            "and stays with the first job that wrote to it; choose another folder"
+        )
 
     job_id = _next_id(tx)
     tx.run(
@@ -148,6 +156,27 @@ def fail_job(tx: Tx, job_id: str, code: str, message: str, planning_fence: int |
     error = {"error_code": code, "error_message": message}
     move_job(tx, job, JobState.FAILED, event_data=error, **error)
     _cancel_pending(tx, job_id)
+
+
+def defer_job(tx: Tx, job_id: str, base_s: float, max_s: float, planning_fence: int | None) -> Deferral:
+    """See `Store.defer_job`."""
+    job = lock_job(tx, job_id)
+    if planning_fence is not None and not is_planned_by(job, planning_fence):
+        return Deferral(0, 0.0, 0.0)
+    wait_s = min(max_s, base_s * 2.0 ** min(job.failures, _MAX_DOUBLINGS))
+    since = job.failing_since or tx.now
+    tx.run(
+        update(jobs)
+        .where(jobs.c.id == job_id)
+        .values(
+            failures=job.failures + 1,
+            failing_since=since,
+            not_before=tx.now + timedelta(seconds=wait_s),
+            planning_holder=None,
+            planning_expires_at=None,
+        )
+    )
+    return Deferral(job.failures + 1, (tx.now - since).total_seconds(), wait_s)
 
 
 def begin_finalizing(tx: Tx, job_id: str) -> bool:

@@ -16,7 +16,7 @@ from services.domain.events import EventKind
 from services.domain.models import ShardPlan, shard_id
 from services.domain.states import JobState, ShardState, VideoStatus
 from services.store.database import Tx
-from services.store.jobs import is_planned_by, lock_job, move_job
+from services.store.jobs import NO_FAILURES, is_planned_by, lock_job, move_job
 from services.store.schema import jobs, shards, videos
 
 
@@ -27,6 +27,8 @@ def begin(tx: Tx, job_id: str, holder: str, ttl_s: float) -> int | None:
     if state is not JobState.QUEUED and (state is not JobState.RUNNING or job.planned):
         return None
     if job.planning_expires_at is not None and job.planning_expires_at > tx.now and job.planning_holder != holder:
+        return None
+    if job.not_before is not None and job.not_before > tx.now:
         return None
     if state is JobState.QUEUED:
         move_job(tx, job, JobState.RUNNING, started_at=tx.now)
@@ -55,7 +57,8 @@ def add_shards(tx: Tx, job_id: str, fence: int, plans: Iterable[ShardPlan], ttl_
     tx.run(insert(shards), [_shard_row(job_id, plan) for plan in new])
     tx.run(insert(videos), [row for plan in new for row in _video_rows(job_id, plan)])
     num_videos = sum(len(plan.videos) for plan in new)
-    _change(tx, job_id, shards_total=jobs.c.shards_total + len(new), videos_total=jobs.c.videos_total + num_videos)
+    totals = {"shards_total": jobs.c.shards_total + len(new), "videos_total": jobs.c.videos_total + num_videos}
+    _change(tx, job_id, **totals, **NO_FAILURES)
     tx.emit(job_id, EventKind.SHARDS_PLANNED, shards=len(new), videos=num_videos)
     return True
 
@@ -65,7 +68,7 @@ def finish(tx: Tx, job_id: str, fence: int) -> bool:
     job = lock_job(tx, job_id)
     if not is_planned_by(job, fence):
         return False
-    _change(tx, job_id, planned=True, planning_holder=None, planning_expires_at=None)
+    _change(tx, job_id, planned=True, planning_holder=None, planning_expires_at=None, **NO_FAILURES)
     tx.emit(job_id, EventKind.PLANNING_FINISHED, shards=job.shards_total, videos=job.videos_total)
     return True
 

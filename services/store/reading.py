@@ -5,7 +5,7 @@ from __future__ import annotations
 from datetime import datetime, timedelta
 from typing import Any
 
-from sqlalchemy import Row, Select, and_, func, or_, select
+from sqlalchemy import ColumnElement, Row, Select, and_, func, or_, select
 
 from services.domain.errors import InvalidPageToken, JobNotFound
 from services.domain.models import (
@@ -55,14 +55,18 @@ def unplanned(holder: str, now: datetime) -> Select[Any]:
         jobs.c.planning_expires_at.is_(None), jobs.c.planning_expires_at <= now, jobs.c.planning_holder == holder
     )
     open_plan = and_(jobs.c.state == JobState.RUNNING.value, ~jobs.c.planned, free)
-    return select(jobs).where(or_(jobs.c.state == JobState.QUEUED.value, open_plan))
+    return select(jobs).where(or_(jobs.c.state == JobState.QUEUED.value, open_plan), _has_its_turn(now))
 
 
-def finalizable() -> Select[Any]:
+def finalizable(now: datetime) -> Select[Any]:
     settled = and_(
         jobs.c.state == JobState.RUNNING.value, jobs.c.planned, jobs.c.shards_committed == jobs.c.shards_total
     )
-    return select(jobs).where(or_(jobs.c.state == JobState.FINALIZING.value, settled))
+    return select(jobs).where(or_(jobs.c.state == JobState.FINALIZING.value, settled), _has_its_turn(now))
+
+
+def _has_its_turn(now: datetime) -> ColumnElement[bool]:
+    return or_(jobs.c.not_before.is_(None), jobs.c.not_before <= now)
 
 
 def list_videos(

@@ -92,6 +92,10 @@ jobs = Table(
     Column("planning_fence", BigInteger, nullable=False, server_default=text("0")),
     Column("planning_holder", String(255)),
     Column("planning_expires_at", UtcDateTime),
+    # Failures in a row to plan or to finalise it, since when, and when it has its next turn.
+    Column("failures", Integer, nullable=False, server_default=text("0")),
+    Column("failing_since", UtcDateTime),
+    Column("not_before", UtcDateTime),
     Column("error_code", String(64)),
     Column("error_message", Text),
     Column("created_at", UtcDateTime, nullable=False),
@@ -108,13 +112,13 @@ jobs = Table(
     _count("frames_committed"),
     _one_of("state", JobState),
     Index("ix_jobs_state_id", "state", "id"),
-    # An output belongs to one job that is alive or has succeeded.
+    # An output belongs to one job; one that ended before it had shards has left no trace in it.
     Index(
         "uq_jobs_output_owner",
         "output",
         unique=True,
-        sqlite_where=text("state NOT IN ('failed', 'cancelled')"),
-        postgresql_where=text("state NOT IN ('failed', 'cancelled')"),
+        sqlite_where=text("state NOT IN ('failed', 'cancelled') OR shards_total > 0"),
+        postgresql_where=text("state NOT IN ('failed', 'cancelled') OR shards_total > 0"),
     ),
 )
 

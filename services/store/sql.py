@@ -20,7 +20,7 @@ from services.domain.models import (
 )
 from services.domain.states import JobState, VideoStatus
 from services.store import jobs, leases, migrations, planning, reading
-from services.store.base import VideoRow
+from services.store.base import Deferral, VideoRow
 from services.store.database import Database
 
 
@@ -83,6 +83,9 @@ class SqlStore:
     def fail_job(self, job_id: str, code: str, message: str, *, planning_fence: int | None = None) -> None:
         self._db.write(lambda tx: jobs.fail_job(tx, job_id, code, message, planning_fence))
 
+    def defer_job(self, job_id: str, *, base_s: float, max_s: float, planning_fence: int | None = None) -> Deferral:
+        return self._db.write(lambda tx: jobs.defer_job(tx, job_id, base_s, max_s, planning_fence))
+
     # Leases ---------------------------------------------------------------------------------------------------------
     def claim(self, holder: str, *, limit: int, ttl_s: float) -> list[Lease]:
         return self._db.write(lambda tx: leases.claim(tx, holder, limit, ttl_s))
@@ -109,7 +112,7 @@ class SqlStore:
     # Finalising -----------------------------------------------------------------------------------------------------
     def next_finalizable(self) -> Job | None:
         while True:
-            job = self._db.read(lambda tx: reading.first_job(tx, reading.finalizable()))
+            job = self._db.read(lambda tx: reading.first_job(tx, reading.finalizable(tx.now)))
             if job is None or job.state is JobState.FINALIZING:
                 return job
             # Somebody else may have cancelled or failed it meanwhile: then look again.

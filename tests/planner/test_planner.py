@@ -19,7 +19,8 @@ from services.domain.states import JobState
 from services.planner import Turn, plan_next
 from services.planner.listing import Found, expand
 from services.planner.packing import SeenVideos, new_videos, pack, shard_room
-from services.planner.planning import CLAIM_KEY
+from services.planner.planning import CLAIM_KEY, claim_output
+from services.storage import ObjectStore
 from services.store.base import Store
 from services.store.sql import SqlStore
 
@@ -201,7 +202,7 @@ class TestJobs:
         undisturbed = submit(store, tmp_path / "a", videos, shard_max_videos=2)
         assert plan_next(store, "planner")
 
-        class Crash(Exception):
+        class Crash(BaseException):
             pass
 
         class DyingStore(SqlStore):
@@ -231,7 +232,7 @@ class TestJobs:
         make(videos, *(f"{i:02d}.mp4" for i in range(14)))
         job_id = submit(store, tmp_path / "out", videos, shard_max_videos=2)
 
-        class Crash(Exception):
+        class Crash(BaseException):
             pass
 
         class SecondStore(SqlStore):
@@ -314,11 +315,42 @@ class TestJobs:
         make(videos, "a.mp4")
         make(tmp_path, "file")
         job_id = submit(store, tmp_path / "file" / "out", videos)
-        with pytest.raises(StorageError):
-            plan_next(store, "planner")
+        assert plan_next(store, "planner")
+        job = store.get_job(job_id)
+        assert (job.state, job.error_code) == (JobState.FAILED, "storage_refused")
+
+    @pytest.mark.parametrize(
+        ("error", "code"), [(StorageError("slow down"), "storage_error"), (ZeroDivisionError("oops"), "internal_error")]
+    )
+    def test_an_output_that_does_not_answer_holds_up_nobody_else(
+        self,
+        store: SqlStore,
+        videos: Path,
+        tmp_path: Path,
+        monkeypatch: pytest.MonkeyPatch,
+        error: Exception,
+        code: str,
+    ) -> None:
+        make(videos, "a.mp4")
+        job_id, good = (submit(store, tmp_path / name, videos) for name in ("down", "good"))
+
+        def claim(output: ObjectStore, job_id: str) -> None:
+            if output.uri.endswith("down"):
+                raise error
+            claim_output(output, job_id)
+
+        monkeypatch.setattr("services.planner.planning.claim_output", claim)
+        assert plan_next(store, "planner", backoff_base_s=600, backoff_max_s=600)
+        assert plan_next(store, "planner")
+        assert store.get_job(good).planned
+        assert not plan_next(store, "planner"), "it waits for its turn"
         assert store.get_job(job_id).state is JobState.RUNNING
-        assert plan_next(store, "planner", give_up_after_s=0)
-        assert store.get_job(job_id).error_code == "storage_error"
+
+        late = submit(store, tmp_path / "late-down", videos)
+        assert plan_next(store, "planner", backoff_base_s=0, give_up_after_s=600)
+        assert plan_next(store, "planner", backoff_base_s=0, give_up_after_s=0)
+        job = store.get_job(late)
+        assert (job.state, job.error_code) == (JobState.FAILED, code)
 
     def test_a_job_cancelled_while_it_is_planned(self, store: SqlStore, videos: Path, tmp_path: Path) -> None:
         make(videos, "a.mp4")

@@ -63,6 +63,18 @@ class TestJobs:
         store.request_cancel(owner.id)
         store.create_job(spec(same))
 
+    @pytest.mark.parametrize("how", ["fail", "cancel"])
+    def test_an_output_stays_with_the_first_job_that_wrote_to_it(self, store: SqlStore, how: str) -> None:
+        without_shards, _ = store.create_job(spec())
+        store.fail_job(without_shards.id, "input_unavailable", "no such folder")
+        owner = planned_job(store)
+        if how == "fail":
+            store.fail_job(owner, "storage_refused", "gone")
+        else:
+            store.request_cancel(owner)
+        with pytest.raises(OutputInUse, match=f"{owner}.*choose another folder"):
+            store.create_job(spec())
+
     def test_s3_outputs_have_one_spelling(self, store: SqlStore) -> None:
         store.create_job(spec("s3://bucket/prefix"))
         with pytest.raises(OutputInUse):
@@ -169,6 +181,30 @@ class TestPlanning:
         other = ShardPlan(0, (VideoRef("late", "/in/late.mp4", 1),))
         with pytest.raises(InvalidTransition, match="shard 0"):
             store.add_shards(job.id, fence, [other], ttl_s=60)
+
+    def test_a_job_that_fails_to_move_along_waits(self, store: SqlStore) -> None:
+        first, second = (store.create_job(spec(f"/out{i}"))[0].id for i in range(2))
+        fence = begin_planning(store, first)
+        assert store.defer_job(first, base_s=600, max_s=1000, planning_fence=fence + 1).failures == 0, "not its turn"
+        deferral = store.defer_job(first, base_s=600, max_s=1000, planning_fence=fence)
+        assert (deferral.failures, deferral.failing_s, deferral.wait_s) == (1, 0.0, 600)
+        unplanned = store.next_unplanned("planner")
+        assert unplanned is not None
+        assert unplanned.id == second
+        assert store.begin_planning(first, "planner", ttl_s=60) is None
+        assert store.defer_job(first, base_s=600, max_s=1000).wait_s == 1000
+        assert store.defer_job(first, base_s=0, max_s=1000).failures == 3
+        fence = begin_planning(store, first, "other")
+        assert store.add_shards(first, fence, plans(1), ttl_s=60)
+        assert store.defer_job(first, base_s=0, max_s=0).failures == 1, "it got along in between"
+
+    def test_a_job_that_cannot_be_finalised_waits(self, store: SqlStore) -> None:
+        job_id = planned_job(store, 1)
+        (lease,) = store.claim("a", limit=1, ttl_s=60)
+        store.record_commit(record(lease))
+        assert store.next_finalizable() is not None
+        store.defer_job(job_id, base_s=600, max_s=600)
+        assert store.next_finalizable() is None
 
     def test_failing_a_job(self, store: SqlStore) -> None:
         job_id = planned_job(store, 2)

@@ -26,6 +26,9 @@ def upgrade() -> None:
         sa.Column("planning_fence", sa.BigInteger(), server_default=sa.text("0"), nullable=False),
         sa.Column("planning_holder", sa.String(length=255), nullable=True),
         sa.Column("planning_expires_at", _TIME, nullable=True),
+        sa.Column("failures", sa.Integer(), server_default=sa.text("0"), nullable=False),
+        sa.Column("failing_since", _TIME, nullable=True),
+        sa.Column("not_before", _TIME, nullable=True),
         sa.Column("error_code", sa.String(length=64), nullable=True),
         sa.Column("error_message", sa.Text(), nullable=True),
         sa.Column("created_at", _TIME, nullable=False),
@@ -52,8 +55,8 @@ def upgrade() -> None:
         "jobs",
         ["output"],
         unique=True,
-        sqlite_where=sa.text("state NOT IN ('failed', 'cancelled')"),
-        postgresql_where=sa.text("state NOT IN ('failed', 'cancelled')"),
+        sqlite_where=sa.text("state NOT IN ('failed', 'cancelled') OR shards_total > 0"),
+        postgresql_where=sa.text("state NOT IN ('failed', 'cancelled') OR shards_total > 0"),
     )
 
     op.create_table(
