@@ -219,3 +219,49 @@ def test_same_input_same_bytes(room: BoxRoom) -> None:
         arrays = [x for m in (forward, backward, tracks) for x in (m.target_px, m.weight)]
         results.append((b"".join(x.tobytes() for x in arrays), focal))
     assert results[0] == results[1]
+
+
+def picture(width: int, height: int, seed: int, shift: int = 0) -> WorkingFrame:
+    noise = np.random.default_rng(seed).integers(0, 256, (height + 32, width + 64), dtype=np.uint8)
+    gray = np.ascontiguousarray(cv2.GaussianBlur(noise, (0, 0), 2)[16:-16, 16 + shift : 16 + shift + width])
+    return WorkingFrame(0, gray, cv2.cvtColor(gray, cv2.COLOR_GRAY2RGB))
+
+
+def test_a_matcher_forgets_earlier_pairs_and_their_guesses() -> None:
+    used = DisFlowMatcher()
+    for width, height in ((320, 240), (64, 96), (640, 480), (640, 480), (400, 32)):
+        fresh = DisFlowMatcher()
+        a, b = (fresh.encode(picture(width, height, 1, shift)) for shift in (0, 5))
+        assert used.motion_px(a, b) == fresh.motion_px(a, b)
+        for measured, expected in zip(used.match(a, b), fresh.match(a, b), strict=True):
+            np.testing.assert_array_equal(measured.target_px, expected.target_px)
+        np.testing.assert_array_equal(used.match_fast(a, b).target_px, fresh.match_fast(a, b).target_px)
+        other = fresh.encode(picture(width, height, 2))
+        guess = cell_centres_px(a.grid) + np.array([0.3 * width, 9])
+        used.match(a, other, guess)
+        used.match_fast(other, a, guess)
+
+
+@pytest.mark.parametrize(
+    ("gray", "blank"),
+    [
+        (np.zeros((96, 128)), True),
+        (np.full((96, 128), 255), True),
+        (16 + np.random.default_rng(0).integers(-1, 2, (96, 128)), True),
+        (np.random.default_rng(0).integers(0, 256, (96, 128)), False),
+        (np.pad(np.random.default_rng(0).integers(0, 256, (24, 24)), ((60, 12), (90, 14))), False),
+        (np.linspace(0, 255, 128)[None].repeat(96, 0), False),
+    ],
+    ids=["black", "white", "noise of a grey level", "texture", "a logo", "a ramp"],
+)
+def test_blank_is_black_white_and_noise_but_no_picture(gray: np.ndarray, blank: bool) -> None:
+    matcher = DisFlowMatcher()
+    rgb = cv2.cvtColor(gray.astype(np.uint8), cv2.COLOR_GRAY2RGB)
+    assert matcher.is_blank(matcher.encode(frame(rgb))) is blank
+
+
+def test_a_frame_that_is_masked_all_over_is_blank(room: BoxRoom) -> None:
+    matcher = DisFlowMatcher()
+    rgb = room.render(look((0, 0, -3)))[0]
+    assert not matcher.is_blank(matcher.encode(frame(rgb)))
+    assert matcher.is_blank(matcher.encode(frame(rgb, valid=np.zeros(rgb.shape[:2], bool))))

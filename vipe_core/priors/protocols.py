@@ -56,6 +56,10 @@ class DenseMatcher(Protocol):
     def encode(self, frame: WorkingFrame) -> Any:
         """Per-frame features, computed once and kept with the keyframe."""
 
+    def is_blank(self, features: Any) -> bool:
+        """Whether the picture holds nothing to match, such as a black one: neither its motion nor a match with it means
+        anything."""
+
     def motion_px(self, source: Any, target: Any) -> float:
         """Cheap median displacement over textured cells, in pixels: the motion filter's score."""
 

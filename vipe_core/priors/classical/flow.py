@@ -6,6 +6,7 @@ of the search, the role that the recurrent update has in the paper.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import cv2
@@ -33,28 +34,69 @@ _MIN_FB_WEIGHT = 0.02
 _WIDE_MOTION_RATIO = 0.1
 
 
+# A picture of which less than this share of the cells shows structure of this level is blank: what is left is the
+# noise of a camera or an encoder, a structure of about 0.2 for each grey level of its standard deviation squared.
+_BLANK_SHARE = 0.01
+_BLANK_STRUCTURE = 0.5
+
+
+class _Flow:
+    """One kind of OpenCV's flow, as a function of its arguments alone.
+
+    An object of OpenCV's that was once given a starting flow keeps it, and searches around it in every later call
+    without one, whatever pictures that is about (and beyond its end when they are larger). So calls with and without a
+    starting flow have an object each. Both are made anew for another picture size.
+    """
+
+    def __init__(self, make: Callable[[], Any]) -> None:
+        self._make = make
+        self._shape: tuple[int, ...] = ()
+
+    def calc(self, source: Array, target: Array, init: Array | None = None) -> NDArray[np.float32]:
+        """(h, w, 2) flow from `source` to `target`, two (h, w) uint8 pictures, with `init` as a candidate."""
+        if self._shape != source.shape:
+            self._shape = source.shape
+            self._free, self._guided = self._make(), self._make()
+        return np.asarray((self._free if init is None else self._guided).calc(source, target, init))
+
+
+def _preset(preset: int) -> _Flow:
+    return _Flow(lambda: cv2.DISOpticalFlow.create(preset))
+
+
+def _motion_only() -> Any:
+    flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_FAST)
+    flow.setFinestScale(1)
+    flow.setVariationalRefinementIterations(0)
+    return flow
+
+
 class DisFlowMatcher:
     """`DenseMatcher` without a network. One instance per thread: OpenCV's flow object owns its buffers."""
 
     def __init__(self) -> None:
-        self._medium = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
-        self._fast = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_FAST)
-        self._ultrafast = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST)
-        self._half = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_FAST)
-        self._half.setFinestScale(1)
-        self._half.setVariationalRefinementIterations(0)
+        self._medium = _preset(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+        self._fast = _preset(cv2.DISOPTICAL_FLOW_PRESET_FAST)
+        self._ultrafast = _preset(cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST)
+        self._half = _Flow(_motion_only)
 
     def encode(self, frame: WorkingFrame) -> FlowFeatures:
         """Features of a frame; needs at least 16 x 16 pixels."""
         gray = np.ascontiguousarray(frame.gray)
         return FlowFeatures(frame.index, gray, frame.valid, grid_of(gray))
 
+    def is_blank(self, features: FlowFeatures) -> bool:
+        """Whether the picture holds nothing to match: black, white, or noise of a grey level or so."""
+        usable = features.usable_cells
+        strength = features.structure.max(axis=1)[usable]
+        return not len(strength) or float((strength >= _BLANK_STRUCTURE).mean()) < _BLANK_SHARE
+
     def motion_px(self, source: FlowFeatures, target: FlowFeatures) -> float:
         """Median displacement over textured cells, pixels (the mean would follow moving objects)."""
         cells = source.textured_cells
         if not cells.any():
             return 0.0
-        flow = self._half.calc(source.half, target.half, None)
+        flow = self._half.calc(source.half, target.half)
         points = (cell_centres_px(source.grid) - 0.5) / 2
         return 2 * float(np.median(np.linalg.norm(sample_px(flow, points[cells]), axis=1)))
 
@@ -75,13 +117,9 @@ class DisFlowMatcher:
         backward = self._ultrafast.calc(target.gray, source.gray, init)
         return _measure(source, target, forward, backward)
 
-    def flow_px(self, source: Array, target: Array) -> NDArray[np.float32]:
-        """Dense (h, w, 2) flow between two gray images at the quality of `match`."""
-        return np.asarray(self._medium.calc(source, target, None))
-
-    def _refined(self, dis: Any, source: Array, target: Array, init: Array | None) -> NDArray[np.float32]:
+    def _refined(self, dis: _Flow, source: Array, target: Array, init: Array | None) -> NDArray[np.float32]:
         if init is None:
-            return np.asarray(dis.calc(source, target, None))
+            return dis.calc(source, target)
         height, width = source.shape
         reach = float(np.median(np.linalg.norm(cell_mean(init), axis=-1)))
         if reach > _WIDE_MOTION_RATIO * float(np.hypot(height, width)):
@@ -91,9 +129,8 @@ class DisFlowMatcher:
             warped = cv2.remap(
                 target, u + init[..., 0], v + init[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
             )
-            residual = self._fast.calc(source, warped, None)
-            init = init + residual
-        return np.asarray(dis.calc(source, target, np.array(init, np.float32, order="C")))
+            init = init + self._fast.calc(source, warped)
+        return dis.calc(source, target, np.array(init, np.float32, order="C"))
 
 
 def _initial_flows(
