@@ -16,6 +16,7 @@ from typing import Any
 
 import pytest
 import yaml
+from typer.core import TyperGroup
 from typer.main import get_command
 
 from services.api.server import check_exposure
@@ -161,7 +162,8 @@ def test_container_commands_exist_in_the_program() -> None:
     commands = shell_commands()
     assert len(commands) == 4
     for _, name, *arguments in commands:
-        subcommand = program.commands[name]  # type: ignore[attr-defined]
+        assert isinstance(program, TyperGroup)
+        subcommand = program.commands[name]
         with subcommand.make_context(name, arguments):
             pass  # click parsed every option
 
