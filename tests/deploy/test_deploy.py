@@ -223,6 +223,72 @@ def test_cluster_runs_the_ray_of_the_lock() -> None:
     )
 
 
+def ray_pods() -> list[tuple[dict[str, Any], dict[str, Any]]]:
+    """(labels, container) of everything that is a node of the Ray cluster: head, workers, agent."""
+    cluster = next(document for document in manifests() if document["kind"] == "RayCluster")["spec"]
+    agent = next(document for document in manifests() if document["metadata"]["name"] == "vipe-agent")
+    templates = [cluster["headGroupSpec"]["template"], *(group["template"] for group in cluster["workerGroupSpecs"])]
+    templates.append(agent["spec"]["template"])
+    return [(template["metadata"]["labels"], template["spec"]["containers"][0]) for template in templates]
+
+
+def test_ray_serves_only_holders_of_the_token() -> None:
+    assert len(ray_pods()) == 3
+    for _, container in ray_pods():
+        variables = {variable["name"]: variable for variable in container["env"]}
+        assert variables["RAY_AUTH_MODE"]["value"] == "token"
+        assert variables["RAY_AUTH_TOKEN"]["valueFrom"]["secretKeyRef"] == {"name": "vipe", "key": "ray-auth-token"}
+    cluster = next(document for document in manifests() if document["kind"] == "RayCluster")["spec"]
+    assert cluster["headGroupSpec"]["rayStartParams"]["dashboard-host"] == "127.0.0.1"
+    needed = (DEPLOY / "kuberay/kustomization.yaml").read_text()
+    for reference in re.findall(r"name: vipe, key: ([a-z-]+)", "".join(p.read_text() for p in kuberay_files())):
+        assert reference in needed, f"the Secret's key {reference} is not asked for"
+    bound = re.search(r'"ray>=(\d+)\.(\d+)"', (ROOT / "pyproject.toml").read_text())
+    assert bound is not None
+    assert (int(bound[1]), int(bound[2])) >= (2, 52), "an older Ray ignores the token"
+
+
+def kuberay_files() -> list[Path]:
+    return sorted((DEPLOY / "kuberay").glob("*.yaml"))
+
+
+def test_slots_are_as_many_as_the_gpus_of_the_cluster() -> None:
+    settings = next(document for document in manifests() if document["kind"] == "ConfigMap")["data"]
+    groups = next(document for document in manifests() if document["kind"] == "RayCluster")["spec"]["workerGroupSpecs"]
+    gpus = sum(
+        group["replicas"] * int(group["template"]["spec"]["containers"][0]["resources"]["limits"]["nvidia.com/gpu"])
+        for group in groups
+    )
+    assert int(settings["VIPE_NUM_SLOTS"]) == gpus
+
+
+def test_probes_ask_what_minimal_ray_answers() -> None:
+    """Without probes of ours the operator adds its own, which need a dashboard and wget."""
+    cluster = next(document for document in manifests() if document["kind"] == "RayCluster")["spec"]
+    for group in (cluster["headGroupSpec"], *cluster["workerGroupSpecs"]):
+        (container,) = group["template"]["spec"]["containers"]
+        ports = {port["name"]: port["containerPort"] for port in container["ports"]}
+        assert str(ports.get("raylet", 6380)) == group["rayStartParams"]["node-manager-port"]
+        for probe in ("readinessProbe", "livenessProbe"):
+            assert container[probe]["tcpSocket"]["port"] in ports
+
+
+def test_the_network_is_closed_but_for_the_api_and_metrics() -> None:
+    policies = {d["metadata"]["name"]: d["spec"] for d in manifests() if d["kind"] == "NetworkPolicy"}
+    assert policies.pop("deny-by-default") == {"podSelector": {}, "policyTypes": ["Ingress"]}
+    ray = policies["ray"]
+    (term,) = ray["podSelector"]["matchExpressions"]
+    assert {labels["app"] for labels, _ in ray_pods()} == set(term["values"])
+    assert ray["ingress"] == [{"from": [{"podSelector": ray["podSelector"]}]}], "from each other, and from nobody else"
+    opened = {p["podSelector"]["matchLabels"]["app"]: p for name, p in policies.items() if name != "ray"}
+    for deployment in (d for d in manifests() if d["kind"] == "Deployment"):
+        template = deployment["spec"]["template"]
+        policy = opened.pop(template["metadata"]["labels"]["app"])
+        ports = {port["name"] for port in template["spec"]["containers"][0]["ports"]}
+        assert {port["port"] for rule in policy["ingress"] for port in rule["ports"]} == ports
+    assert not opened
+
+
 def test_pods_run_unprivileged() -> None:
     for document in manifests():
         for template in pod_specs(document):
@@ -249,7 +315,7 @@ def test_kustomize_renders_with_tagged_images() -> None:
     ).stdout
     documents = list(yaml.safe_load_all(rendered))
     assert {document["kind"] for document in documents} == {
-        "Namespace", "ConfigMap", "Deployment", "Service", "RayCluster",
+        "Namespace", "ConfigMap", "Deployment", "Service", "RayCluster", "NetworkPolicy",
     }  # fmt: skip
     images = {container["image"] for document in documents for container in containers(document)}
     assert images == {"vipe-api:0.1.0", "vipe-worker:0.1.0-gpu"}
