@@ -67,6 +67,9 @@ class ExactScene:
     def encode(self, frame: WorkingFrame) -> int:
         return frame.index
 
+    def is_blank(self, features: int) -> bool:
+        return False
+
     def motion_px(self, source: int, target: int) -> float:
         match = self.measure(source, target)
         seen = match.weight[:, 0] > 0

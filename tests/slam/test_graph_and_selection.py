@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+import math
+from collections.abc import Generator, Sequence
 
 import numpy as np
 import pytest
@@ -105,24 +106,38 @@ def test_unmeasured_cells_take_their_neighbours_depth() -> None:
 
 
 class Ruler:
-    """A video on a line: frame k shows position `positions[k]`, and the motion between frames is their distance."""
+    """A video on a line: frame k shows position `positions[k]`, and the motion between frames is their distance.
+
+    NaN is a blank frame. `open` counts the streams that nobody has closed.
+    """
 
     def __init__(self, positions: Sequence[float]) -> None:
         self._positions = list(positions)
+        self.open = 0
 
     @property
     def info(self) -> VideoInfo:
         return VideoInfo("ruler", "ruler", 640, 480, 30.0, None, None, 0, "none", "rgb24", 0)
 
-    def frames(self, size: tuple[int, int] | None = None, start: int = 0, stop: int | None = None) -> Iterator[Frame]:
-        blank: NDArray[np.uint8] = np.zeros((8, 8, 3), dtype=np.uint8)
-        for index in range(len(self._positions))[start:stop]:
-            yield Frame(index, index * 0.1, blank)
+    def frames(
+        self, size: tuple[int, int] | None = None, start: int = 0, stop: int | None = None
+    ) -> Generator[Frame, None, None]:
+        picture: NDArray[np.uint8] = np.zeros((8, 8, 3), dtype=np.uint8)
+        self.open += 1
+        try:
+            for index in range(len(self._positions))[start:stop]:
+                yield Frame(index, index * 0.1, picture)
+        finally:
+            self.open -= 1
 
     def encode(self, frame: WorkingFrame) -> float:
         return self._positions[frame.index]
 
+    def is_blank(self, features: float) -> bool:
+        return math.isnan(features)
+
     def motion_px(self, source: float, target: float) -> float:
+        assert not math.isnan(source + target), "motion against a blank frame means nothing"
         return abs(target - source)
 
     def match(self, source: float, target: float, guess_px: object = None) -> tuple[Match, Match]:
@@ -175,6 +190,40 @@ def test_the_sample_is_bounded_and_evenly_spaced(count: int, capacity: int) -> N
 def test_no_frame_is_a_typed_error() -> None:
     with pytest.raises(EmptyMedia):
         select([])
+
+
+def test_blank_frames_are_passed_over() -> None:
+    walk = [10.0 * k for k in range(30)]
+    selection = select([math.nan] * 5 + walk[:10] + [math.nan] * 2 + walk[10:] + [math.nan] * 3)
+    assert selection.num_frames == 40
+    assert indices(selection)[:3] == [5, 8, 11]
+    assert not {15, 16} & set(indices(selection))
+    assert indices(selection)[-1] == 36
+    assert selection.max_motion_px >= 24
+
+
+def test_a_video_of_blank_frames_keeps_its_first() -> None:
+    selection = select([math.nan] * 9)
+    assert indices(selection) == [0]
+    assert selection.max_motion_px == 0
+
+
+@pytest.mark.parametrize("passes", [1, 2])
+def test_a_cancelled_selection_closes_the_video_while_the_error_is_still_held(passes: int) -> None:
+    # Slow, and longer than the sample: the second pass, at a lower threshold, decodes again.
+    ruler = Ruler([1.5 * k for k in range(40)])
+    calls = 0
+
+    def report(stage: str, done: int, total: int | None) -> None:
+        nonlocal calls
+        calls += 1
+        if calls == 40 * (passes - 1) + 7:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt) as caught:
+        select_keyframes(ruler, working_size(640, 480, 640 * 480), ruler, SlamSettings(sample_frames=8), report)
+    assert caught.value.__traceback__ is not None
+    assert ruler.open == 0
 
 
 # -- working size --------------------------------------------------------------------------------------------------

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -157,12 +157,6 @@ class Adjuster:
                 return result
             result = solved
         return result
-
-    def motion_only(self, problem: Problem, state: State, schedule: Sequence[Step]) -> Result | None:
-        """`anneal` with every inverse depth and the focal length held."""
-        held = torch.zeros_like(problem.free.inverse_depth)
-        free = replace(problem.free, inverse_depth=held, focal=False, distortion=False)
-        return self.anneal(replace(problem, free=free, priors=Priors()), state, schedule)
 
     def _state(self, poses: Array, depths: Array, intrinsics: Array) -> State:
         return State(

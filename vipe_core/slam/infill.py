@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import bisect
+from contextlib import closing
 from dataclasses import dataclass
 from typing import Any
 
@@ -95,14 +96,17 @@ class Infill:
             poses[index] = keyframes.pose(k)
             inlier_ratio[index] = 1.0
         pending: list[_Pending] = []
-        for frame in source.frames(size.size, stop=count):
-            if frame.index not in number:
-                features = self._matcher.encode(working_frame(frame))
-                pending.append(self._measure(frame.index, features, poses[frame.index]))
-                if len(pending) == self._batch:
-                    self._solve(pending, poses, inlier_ratio)
-                    pending = []
-            report("infill", frame.index + 1, count)
+        with closing(source.frames(size.size, stop=count)) as frames:
+            for frame in frames:
+                if frame.index not in number:
+                    features = self._matcher.encode(working_frame(frame))
+                    # Against a blank frame everything seems to stand still: it keeps its interpolated pose.
+                    if not self._matcher.is_blank(features):
+                        pending.append(self._measure(frame.index, features, poses[frame.index]))
+                    if len(pending) == self._batch:
+                        self._solve(pending, poses, inlier_ratio)
+                        pending = []
+                report("infill", frame.index + 1, count)
         if pending:
             self._solve(pending, poses, inlier_ratio)
         return Trajectory(poses, inlier_ratio)

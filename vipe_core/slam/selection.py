@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Generator
+from contextlib import closing
 from dataclasses import dataclass
 from typing import Any
 
@@ -43,7 +44,8 @@ class Selection:
 
     Attributes:
         timestamps_s: (N,) float64 presentation time of every frame.
-        keyframes: At least one, in time order; the first frame is always one.
+        keyframes: At least one, in time order. The first frame that is not blank is one; blank ones are none, unless
+            there is nothing else.
         sample: Evenly thinned frames, at most `SlamSettings.sample_frames`.
         max_motion_px: Largest displacement of any frame against its keyframe, working pixels.
     """
@@ -78,7 +80,10 @@ class _Thinned:
 
 
 class _MotionFilter:
-    """Makes a frame a keyframe when the picture has moved by `threshold_px` since the last one."""
+    """Makes a frame a keyframe when the picture has moved by `threshold_px` since the last one.
+
+    Blank frames (a fade from black, a flash) are passed over: any picture seems to stand still against them.
+    """
 
     def __init__(self, matcher: DenseMatcher, threshold_px: float) -> None:
         self.matcher = matcher
@@ -86,11 +91,15 @@ class _MotionFilter:
         self.keyframes: list[Keyframe] = []
         self.max_motion_px = 0.0
         self.total_motion_px = 0.0
+        self._first_blank: Keyframe | None = None
         self._previous: Keyframe | None = None
         self._previous_motion_px = 0.0
 
     def add(self, frame: WorkingFrame) -> None:
         current = Keyframe(frame.index, self.matcher.encode(frame))
+        if self.matcher.is_blank(current.features):
+            self._first_blank = self._first_blank or current
+            return
         if not self.keyframes:
             self.keyframes.append(current)
             return
@@ -107,6 +116,8 @@ class _MotionFilter:
 
     def finish(self) -> None:
         """Consider the last frame: a keyframe when it adds a visible part of a step, so that nothing hangs over."""
+        if not self.keyframes and self._first_blank is not None:
+            self.keyframes.append(self._first_blank)
         if self._previous is not None:
             if self._previous_motion_px > 0.25 * self.threshold_px:
                 self._take(self._previous, self._previous_motion_px)
@@ -137,22 +148,28 @@ def select_keyframes(
     threshold_px = settings.scaled_px(settings.keyframe_motion_px, size.width)
     static_px = settings.scaled_px(settings.static_motion_px, size.width)
 
-    def first_pass() -> Iterable[WorkingFrame]:
-        for frame in source.frames(size.size):
-            work = working_frame(frame)
-            times.append(frame.timestamp_s)
-            thinned.add(work)
-            yield work
-            report("scan", len(times), source.info.num_frames_hint)
+    def first_pass() -> Generator[WorkingFrame, None, None]:
+        with closing(source.frames(size.size)) as frames:
+            for frame in frames:
+                work = working_frame(frame)
+                times.append(frame.timestamp_s)
+                thinned.add(work)
+                yield work
+                report("scan", len(times), source.info.num_frames_hint)
 
-    def again() -> Iterable[WorkingFrame]:
+    def again() -> Generator[WorkingFrame, None, None]:
         if thinned.spacing == 1:
-            return thinned.frames
-        return (working_frame(frame) for frame in source.frames(size.size, stop=len(times)))
+            yield from thinned.frames
+            return
+        with closing(source.frames(size.size, stop=len(times))) as frames:
+            for frame in frames:
+                yield working_frame(frame)
+                # No progress, but the chance to cancel and the sign of life that a supervisor waits for.
+                report("scan", len(times), len(times))
 
     motion = _filter(first_pass(), matcher, threshold_px)
     if not times:
-        raise EmptyMedia(f"{source.info.path}: holds no frame")
+        raise EmptyMedia(f"{source.info.name}: the video holds no frame; check the recording")
     for _ in range(_MAX_LOWERINGS):
         enough = len(motion.keyframes) >= min(settings.min_keyframes, len(times))
         if enough or motion.max_motion_px < static_px:
@@ -165,9 +182,11 @@ def select_keyframes(
     return Selection(np.array(times, dtype=np.float64), motion.keyframes, thinned.frames, motion.max_motion_px)
 
 
-def _filter(frames: Iterable[WorkingFrame], matcher: DenseMatcher, threshold_px: float) -> _MotionFilter:
+def _filter(stream: Generator[WorkingFrame, None, None], matcher: DenseMatcher, threshold_px: float) -> _MotionFilter:
     motion = _MotionFilter(matcher, threshold_px)
-    for frame in frames:
-        motion.add(frame)
+    # Closed here and not whenever an exception's traceback lets go of it: a decoder process is behind it.
+    with closing(stream) as frames:
+        for frame in frames:
+            motion.add(frame)
     motion.finish()
     return motion

@@ -14,7 +14,6 @@ class SlamSettings:
 
     Attributes:
         working_area_px: Pixel budget of the working image; a frame is never enlarged.
-        grid_stride: Working pixels per cell of the inverse-depth grid.
         keyframe_motion_px: Median textured displacement that makes a new keyframe.
         min_keyframes: The displacement is lowered until a moving clip has this many keyframes.
         static_motion_px: A clip whose every frame stays below this displacement has no camera motion.
@@ -34,7 +33,6 @@ class SlamSettings:
     """
 
     working_area_px: int = 640 * 480
-    grid_stride: int = 8
     keyframe_motion_px: float = 24.0
     min_keyframes: int = 8
     static_motion_px: float = 1.0

@@ -167,7 +167,7 @@ class Slam:
             inverse_depth=keyframes.depths(),
             static=keyframes.statics(),
             working=size,
-            camera=_camera(keyframes.intrinsics, size),
+            camera=Camera.from_index_params("pinhole", keyframes.intrinsics, size.width, size.height),
             motion=motion,
             focal=focal,
             map=found,
@@ -206,12 +206,6 @@ class Slam:
         width, height = source.info.width, source.info.height
         square = Camera("pinhole", (focal_px, focal_px, width / 2, height / 2), width, height)
         return IntrinsicsEstimate(square.resized(size.width, size.height), estimate.log_focal_sigma, estimate.num_pairs)
-
-
-def _camera(intrinsics: NDArray[np.float64], size: WorkingSize) -> Camera:
-    """The camera value of index parameters: the inverse of `Camera.index_params`."""
-    fx, fy, cx, cy = (float(value) for value in intrinsics)
-    return Camera("pinhole", (fx, fy, cx + 0.5, cy + 0.5), size.width, size.height)
 
 
 @contextmanager
