@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -120,7 +120,8 @@ class Annotation:
         scale: `relative` means one unknown scale for poses and depth together.
         depth_kind: `z` along the optical axis, `ray` distance from the centre.
         timings_s: Wall seconds per stage. Filled further while `dense` is consumed; never part of the payload bytes.
-        dense: Starts the dense stream: every frame in order, once per call, in bounded memory.
+        dense: Starts the dense stream: every frame in order, once per call, in bounded memory. Closing it ends its
+            decoders.
     """
 
     name: str
@@ -133,7 +134,7 @@ class Annotation:
     depth_kind: DepthKind
     quality: Quality
     provenance: Provenance
-    dense: Callable[[], Iterator[DenseFrame]]
+    dense: Callable[[], Generator[DenseFrame, None, None]]
     timings_s: dict[str, float] = field(default_factory=dict)
 
     @property

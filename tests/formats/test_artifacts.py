@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import pickle
 import shutil
+from collections.abc import Generator
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,6 +15,7 @@ from artifact_samples import CAMERAS, HEIGHT, WIDTH, depth_of, make_annotation
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from vipe_core.annotation import DenseFrame
 from vipe_core.errors import EngineError, FormatError
 from vipe_core.formats import list_sequences, member_path, read_artifacts, sample_members, write_artifacts
 from vipe_core.video import open_source
@@ -312,3 +314,30 @@ def test_poses_and_cameras_round_trip(
     artifacts = read_artifacts(root, name)
     assert np.allclose(artifacts.world_from_cam, annotation.world_from_cam, atol=1e-6)
     assert artifacts.camera == annotation.camera
+
+
+def test_a_smaller_result_leaves_nothing_of_an_earlier_one(tmp_path: Path) -> None:
+    write_artifacts(make_annotation(), tmp_path)
+    write_artifacts(make_annotation(name="other"), tmp_path)
+    write_artifacts(make_annotation(num_frames=4), tmp_path, attributes=("pose", "intrinsics"))
+    members = sample_members(tmp_path, "clip")
+    assert set(members) == {"pose", "intrinsics"}
+    assert not read_artifacts(tmp_path, "clip").has_depth
+    assert read_artifacts(tmp_path, "other").has_depth
+
+
+def test_a_failed_write_closes_the_dense_stream_while_the_error_is_still_held(tmp_path: Path) -> None:
+    annotation = make_annotation()
+    streams = []
+
+    def dense() -> Generator[DenseFrame, None, None]:
+        streams.append(annotation.dense())
+        return streams[0]
+
+    def full_disk(done: int, total: int) -> None:
+        raise OSError(28, "No space left on device")
+
+    with pytest.raises(OSError, match="No space") as caught:
+        write_artifacts(replace(annotation, dense=dense), tmp_path, progress=full_disk)
+    assert caught.value.__traceback__ is not None
+    assert streams[0].gi_frame is None

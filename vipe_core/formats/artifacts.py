@@ -11,7 +11,7 @@ import math
 import shutil
 import tempfile
 from collections.abc import Callable, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -23,7 +23,7 @@ from vipe_core.annotation import Annotation, DenseFrame, DepthKind
 from vipe_core.cameras import Camera, CameraModel
 from vipe_core.errors import EngineError
 from vipe_core.formats.depth_zip import DepthZipWriter
-from vipe_core.formats.layout import artifact_path, info_path
+from vipe_core.formats.layout import artifact_files, artifact_path, info_path
 from vipe_core.video.encode import VideoWriter
 from vipe_core.video.naming import sanitise_name
 
@@ -64,9 +64,9 @@ def write_artifacts(
 ) -> ArtifactPaths:
     """Write `annotation` below `root`, consuming its dense stream once (not at all without `depth` and `rgb`).
 
-    An earlier result of the same name is replaced: first its `_info.json` goes, then files change, then the new
-    `_info.json` appears, so that its presence always means a complete sequence. Depth is converted to what ViPE's
-    files hold: z for pinhole and mei, distance for panoramas.
+    An earlier result of the same name is replaced: first its `_info.json` goes, then its files, then the new
+    `_info.json` appears, so that its presence always means a complete sequence with nothing of an earlier one. Depth is
+    converted to what ViPE's files hold: z for pinhole and mei, distance for panoramas.
 
     Args:
         annotation: Its name must be a sanitised one.
@@ -91,6 +91,9 @@ def write_artifacts(
     try:
         written = _write_all(annotation, work, attributes, progress)
         info_path(root, name).unlink(missing_ok=True)
+        for attribute in set(ALL_ATTRIBUTES) - set(attributes):
+            for path in artifact_files(root, name, attribute):
+                path.unlink(missing_ok=True)
         moved: dict[str, Path] = {}
         for key, path in written.items():
             moved[key] = root / path.relative_to(work)
@@ -171,7 +174,8 @@ def _write_dense(
     with ExitStack() as stack:
         depth = stack.enter_context(DepthZipWriter(depth_path)) if depth_path else None
         rgb = stack.enter_context(VideoWriter(rgb_path, annotation.fps)) if rgb_path else None
-        for frame in annotation.dense():
+        # Closed here, not when an exception's traceback lets go of it: decoder processes are behind it.
+        for frame in stack.enter_context(closing(annotation.dense())):
             _check_dense(annotation, frame, done)
             if depth is not None:
                 depth.append(frame.depth if factor is None else frame.depth * factor)

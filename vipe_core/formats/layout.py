@@ -45,6 +45,11 @@ def artifact_path(root: str | Path, name: str, attribute: str, suffix: str) -> P
     return Path(root, _MEMBERS[attribute][suffix].format(name))
 
 
+def artifact_files(root: str | Path, name: str, attribute: str) -> list[Path]:
+    """Where the files of one attribute of a sequence are, or would be."""
+    return [Path(root, template.format(name)) for template in _MEMBERS[attribute].values()]
+
+
 def sample_members(root: str | Path, name: str) -> dict[str, dict[str, Path]]:
     """The files of a sequence as attribute -> member suffix -> path; attributes without files are left out.
 

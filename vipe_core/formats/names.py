@@ -31,7 +31,7 @@ class SequenceNames:
                 recorded = json.loads(self._path.read_text())
                 self._sources = {str(name): str(source) for name, source in recorded.items()}
             except (ValueError, AttributeError) as error:
-                raise FormatError(f"{self._path} does not map sequence names to inputs; move it away") from error
+                raise FormatError(f"{FILE_NAME} does not map sequence names to inputs; move it away") from error
         # What another program put here is not ours to replace; names that differ in case alone collide on some disks.
         self._taken = {name.lower() for name in (*self._sources, *list_sequences(root))}
 
