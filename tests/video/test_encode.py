@@ -42,6 +42,7 @@ def test_size_count_and_order_survive(tmp_path: Path, size: tuple[int, int], pix
         (30, Fraction(30)),
         (Fraction(24000, 1001), Fraction(24000, 1001)),
         (7.5, Fraction(15, 2)),
+        (1 / 3600, Fraction(1, 3600)),
     ],
 )
 def test_the_rate_is_exact(tmp_path: Path, fps: float | Fraction, expected: Fraction) -> None:

@@ -116,3 +116,13 @@ def test_a_probe_has_a_wall_budget(tmp_path: Path) -> None:
     path = write_clip(tmp_path / "c.mp4", 2)
     with pytest.raises(DecodeTimeout, match=r"c\.mp4"):
         probe(path, budget_s=0.001)
+
+
+@pytest.mark.parametrize("name", ["x" * 300 + ".mp4", "nul\0byte.mp4"], ids=["too long", "nul"])
+def test_a_name_that_no_file_can_have(tmp_path: Path, name: str) -> None:
+    assert isinstance(refusal(tmp_path / name), MediaNotFound)
+
+
+def test_a_path_through_a_file(tmp_path: Path) -> None:
+    (tmp_path / "clip.mp4").write_bytes(b"x")
+    assert isinstance(refusal(tmp_path / "clip.mp4" / "inner.mp4"), MediaNotFound)

@@ -129,7 +129,7 @@ def main() -> None:
     except VipeError as error:
         link.document(error_document(error))
     except MemoryError:
-        link.document(error_document(DecodeError(f"{request.paths[0]}: out of memory while decoding; try again")))
+        link.document(error_document(DecodeError(f"{request.files[0]}: out of memory while decoding; try again")))
     # Native threads of the codecs need no orderly end, and an orderly end is where they hang.
     os._exit(0)
 

@@ -50,7 +50,9 @@ class VideoWriter:
             raise ValueError(f"fps must be positive, got {fps}")
         self._path = Path(path)
         self._partial = self._path.with_name(f".{self._path.name}.{os.getpid()}.partial")
-        self._rate = Fraction(fps).limit_denominator(_MAX_FPS_DENOMINATOR)
+        # Among multiples of 1 / 1001 there is nothing for a picture an hour: below one per second, round the period.
+        exact = Fraction(fps)
+        self._rate = exact.limit_denominator(_MAX_FPS_DENOMINATOR) if exact >= 1 else 1 / round(1 / exact, 3)
         self._options = {"crf": str(crf), "preset": preset}
         self._threads = threads
         self._container: OutputContainer | None = None

@@ -7,6 +7,7 @@ from pathlib import Path
 from vipe_core.errors import EmptyMedia, MediaNotFound
 from vipe_core.video.limits import Limits
 from vipe_core.video.naming import sanitise_name
+from vipe_core.video.probe import is_directory
 from vipe_core.video.process import DecoderProcess
 from vipe_core.video.source import Frame, FrameStream, VideoInfo
 from vipe_core.video.video_file import STALL_S, check_range
@@ -22,7 +23,7 @@ class ImageDirectorySource:
     """`FrameSource` over the images of one directory (not of its sub-directories).
 
     Order is the plain lexicographic order of file names, so that "10.jpg" comes before "9.jpg": number with leading
-    zeros. Hidden files are skipped. Images are decoded in a killable child, like videos.
+    zeros. Hidden files and links out of the directory are skipped. Images are decoded in a killable child, like videos.
 
     Args:
         path: Directory.
@@ -57,6 +58,10 @@ class ImageDirectorySource:
             self._request("probe", self._files[:1], fps, None, 0, None), self._root.name, stall_s, stall_s
         ) as child:
             size = child.document()["info"]
+        try:
+            size_bytes = sum(file.stat().st_size for file in self._files)
+        except OSError as error:
+            raise MediaNotFound(f"{self._root.name}: the images changed while they were read; try again") from error
         first = self._files[0]
         self._info = VideoInfo(
             name=name or sanitise_name(self._root.name),
@@ -69,7 +74,7 @@ class ImageDirectorySource:
             rotation_deg=0,
             codec=first.suffix.lower().lstrip("."),
             pixel_format="rgb24",
-            size_bytes=sum(file.stat().st_size for file in self._files),
+            size_bytes=size_bytes,
         )
 
     @property
@@ -80,11 +85,6 @@ class ImageDirectorySource:
     def damage(self) -> str | None:
         """Always None: a broken image is an error that names it, since leaving it out would shift every later index."""
         return None
-
-    @property
-    def file_names(self) -> tuple[str, ...]:
-        """Name of the file behind each frame."""
-        return tuple(file.name for file in self._files)
 
     def frames(self, size: tuple[int, int] | None = None, start: int = 0, stop: int | None = None) -> FrameStream:
         """See `FrameSource.frames`."""
@@ -120,16 +120,16 @@ class ImageDirectorySource:
 
 
 def _list_images(root: Path) -> list[Path]:
-    if not root.is_dir():
+    if not is_directory(root):
         raise MediaNotFound(f"{root.name}: no such directory; check the path")
-    files = sorted(
-        (
-            file
-            for file in root.iterdir()
-            if file.suffix.lower() in IMAGE_SUFFIXES and not file.name.startswith(".") and file.is_file()
-        ),
-        key=lambda file: file.name,
-    )
+    try:
+        entries = [file for file in root.iterdir() if file.suffix.lower() in IMAGE_SUFFIXES and file.is_file()]
+    except OSError as error:
+        raise MediaNotFound(f"{root.name}: {error.strerror or 'cannot be listed'}; check the path") from error
+    files = sorted((file for file in entries if not file.name.startswith(".")), key=lambda file: file.name)
+    # A link out of the directory would show what its owner may read and the caller may not.
+    inside = root.resolve()
+    files = [file for file in files if not file.is_symlink() or file.resolve().is_relative_to(inside)]
     if not files:
         kinds = " ".join(sorted(IMAGE_SUFFIXES))
         raise EmptyMedia(f"{root.name}: the directory holds no image; supported are {kinds}")

@@ -6,6 +6,7 @@ from pathlib import Path
 
 from vipe_core.video.image_directory import ImageDirectorySource
 from vipe_core.video.limits import Limits
+from vipe_core.video.probe import is_directory
 from vipe_core.video.source import FrameSource
 from vipe_core.video.video_file import VideoFileSource
 
@@ -22,6 +23,6 @@ def open_source(path: str | Path, *, limits: Limits | None = None, name: str | N
         InputError: MediaNotFound, EmptyMedia, CorruptMedia, NoVideoStream, UnsupportedMedia or MediaTooLarge.
         DecodeTimeout, DecodeCrashed: The decoder process hangs or died.
     """
-    if Path(path).is_dir():
+    if is_directory(Path(path)):
         return ImageDirectorySource(path, limits=limits, name=name)
     return VideoFileSource(path, limits=limits, name=name)

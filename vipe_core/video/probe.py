@@ -15,6 +15,20 @@ from vipe_core.video.wire import Request
 PROBE_BUDGET_S = 60.0
 
 
+def is_directory(path: Path) -> bool:
+    """`Path.is_dir`, with a typed error for what cannot be looked at.
+
+    Raises:
+        MediaNotFound: No permission to look, or a name that no file can have.
+    """
+    try:
+        return stat.S_ISDIR(path.stat().st_mode)
+    except FileNotFoundError:
+        return False
+    except (OSError, ValueError) as error:
+        raise _not_found(path, error) from error
+
+
 def file_size_bytes(path: Path) -> int:
     """Size of a regular, non-empty, readable file.
 
@@ -27,13 +41,18 @@ def file_size_bytes(path: Path) -> int:
         status = path.stat()
         if stat.S_ISREG(status.st_mode):
             path.open("rb").close()
-    except OSError as error:
-        raise MediaNotFound(f"{path.name}: {error.strerror or 'cannot be opened'}; check the path") from error
+    except (OSError, ValueError) as error:
+        raise _not_found(path, error) from error
     if not stat.S_ISREG(status.st_mode):
         raise UnsupportedMedia(f"{path.name}: not a regular file; provide a video file or a directory of images")
     if status.st_size == 0:
         raise EmptyMedia(f"{path.name}: the file has zero bytes; check that the upload is complete")
     return status.st_size
+
+
+def _not_found(path: Path, error: OSError | ValueError) -> MediaNotFound:
+    reason = (error.strerror if isinstance(error, OSError) else None) or "cannot be opened"
+    return MediaNotFound(f"{path.name}: {reason}; check the path")
 
 
 def probe(

@@ -48,6 +48,7 @@ class DecoderProcess:
 
     def __init__(self, request: Request, label: str, stall_s: float, wall_s: float | None = None) -> None:
         self._label = label
+        self._limits = request.limits
         self._stall_s = stall_s
         self._wait_s = max(stall_s, _START_S)
         self._deadline_s = None if wall_s is None else time.monotonic() + wall_s
@@ -66,6 +67,10 @@ class DecoderProcess:
                     start_new_session=True,
                     env=_child_environment(),
                 )
+            except OSError as error:
+                raise DecodeError(
+                    f"{label}: the decoder process cannot be started ({error.strerror}); try again"
+                ) from error
             finally:
                 os.close(write_fd)
             resources.callback(self._kill)
@@ -126,9 +131,10 @@ class DecoderProcess:
                 return
             if header.kind == HEARTBEAT:
                 continue
-            rgb = np.empty((header.height, header.width, 3), dtype=np.uint8)
-            if rgb.nbytes != header.payload_bytes:
+            self._limits.check_picture(self._label, header.width, header.height)
+            if header.payload_bytes != 3 * header.width * header.height:
                 raise DecodeError(f"{self._label}: the decoder process sent a picture of the wrong size; try again")
+            rgb = np.empty((header.height, header.width, 3), dtype=np.uint8)
             self._fill(rgb.data.cast("B"))
             yield Frame(header.index, header.timestamp_s, rgb)
 
@@ -143,7 +149,10 @@ class DecoderProcess:
             raise DecodeError(f"{self._label}: the decoder process sent an oversized document; try again")
         raw = bytearray(header.payload_bytes)
         self._fill(memoryview(raw))
-        document: dict[str, Any] = json.loads(raw)
+        try:
+            document: dict[str, Any] = json.loads(raw)
+        except ValueError as error:
+            raise DecodeError(f"{self._label}: the decoder process sent a damaged document; try again") from error
         raise_error_document(document)
         return document
 
