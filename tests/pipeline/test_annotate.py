@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 from collections.abc import Callable
@@ -14,7 +15,7 @@ from numpy.typing import NDArray
 
 import vipe_core
 from vipe_core.annotation import Annotation, Progress
-from vipe_core.errors import ConfigError, EmptyMedia
+from vipe_core.errors import ConfigError, EmptyMedia, EngineError
 from vipe_core.evaluation.synthetic.clip import ClipKind, SyntheticClip, tiny_clip
 from vipe_core.geometry import umeyama
 from vipe_core.pipeline.annotator import Annotator
@@ -182,3 +183,57 @@ def test_importing_the_video_package_leaves_torch_alone() -> None:
     assert callable(vipe_core.annotate)
     with pytest.raises(AttributeError):
         _ = vipe_core.nothing
+
+
+@pytest.mark.parametrize("turn", ["fade in", "black end"])
+def test_black_frames_at_an_end_are_passed_over(
+    annotator: Annotator, folder: Folder, orbit: SyntheticClip, turn: str
+) -> None:
+    rgb = orbit.rgb.copy()
+    black = np.arange(20) < 6 if turn == "fade in" else np.arange(20) >= 14
+    rgb[black] = 0
+    annotation = annotator.annotate(folder(rgb, turn.replace(" ", "-")))
+    truth, found = orbit.world_from_cam[~black, :3, 3], annotation.world_from_cam[~black, :3, 3]
+    error = umeyama(found, truth).apply(found) - truth
+    path = np.linalg.norm(np.diff(truth, axis=0), axis=1).sum()
+    assert np.sqrt(np.square(error).sum(axis=1).mean()) < 0.02 * path
+    np.testing.assert_array_equal(annotation.quality.frame_inlier_ratio[black], 0)
+    assert (annotation.quality.frame_inlier_ratio[~black] > 0.5).all()
+    assert "interpolated_frames" in annotation.quality.reasons
+    assert "static_camera" not in annotation.quality.reasons
+    np.testing.assert_allclose(annotation.world_from_cam[0], np.eye(4), atol=1e-9)
+
+
+def test_what_a_library_throws_becomes_an_engine_error(
+    annotator: Annotator, orbit_folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def broken(*_: object, **__: object) -> None:
+        raise cv2.error("OpenCV(4) something\nwith a second line")
+
+    annotation = annotator.annotate(orbit_folder)
+    with monkeypatch.context() as patch:
+        patch.setattr("vipe_core.depth.stream.complete", broken)
+        with pytest.raises(EngineError, match=r"orbit: error: OpenCV.* something; please report") as caught:
+            list(annotation.dense())
+        assert isinstance(caught.value.__cause__, cv2.error)
+    monkeypatch.setattr("vipe_core.slam.system.select_keyframes", broken)
+    with pytest.raises(EngineError, match="orbit"):
+        annotator.annotate(orbit_folder)
+
+
+@pytest.mark.parametrize("stage", ["scan", "track", "infill", "depth"])
+def test_the_error_of_a_progress_callback_comes_back_as_it_is_and_leaves_no_decoder(
+    annotator: Annotator, orbit_folder: Path, stage: str
+) -> None:
+    cancelled = ZeroDivisionError("the caller's own")
+
+    def cancel(progress: Progress) -> None:
+        if progress.stage == stage:
+            raise cancelled
+
+    with pytest.raises(ZeroDivisionError) as caught:
+        list(annotator.annotate(orbit_folder, progress=cancel).dense())
+    assert caught.value is cancelled
+    children = Path(f"/proc/self/task/{os.getpid()}/children").read_text().split()
+    commands = [Path(f"/proc/{pid}/cmdline").read_bytes() for pid in children]
+    assert not [command for command in commands if b"decoder_child" in command]

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import importlib.metadata
 import logging
 import time
-from collections.abc import Iterator
-from contextlib import closing
+from collections.abc import Generator, Iterator
+from contextlib import closing, contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -15,12 +14,12 @@ import torch
 from vipe_core.annotation import Annotation, DenseFrame, Progress, ProgressCallback, Provenance
 from vipe_core.depth.stream import DenseDepth
 from vipe_core.depth.types import SceneMap
+from vipe_core.errors import EngineError, VipeError
 from vipe_core.pipeline.device import describe_device, resolve_device, set_threads
 from vipe_core.pipeline.presets import Preset, resolve
-from vipe_core.pipeline.provenance import library_versions
+from vipe_core.pipeline.provenance import engine_version, library_versions
 from vipe_core.priors.classical import classical_priors
 from vipe_core.quality import assess
-from vipe_core.slam.selection import Report
 from vipe_core.slam.system import Slam, SlamResult
 from vipe_core.video import open_source
 from vipe_core.video.source import FrameSource
@@ -67,19 +66,17 @@ class Annotator:
 
         Raises:
             InputError, DecodeError: The input cannot be read. Its code and message are meant for the user.
+            EngineError: A stage failed, a defect of ours; what went wrong is its `__cause__`. So does the dense stream.
         """
         source = open_source(path, name=name)
-
-        def report(stage: str, done: int, total: int | None) -> None:
-            if progress is not None:
-                progress(Progress(stage, done, total))
+        report = _Reporter(progress)
 
         # New matchers for each video: OpenCV's flow object keeps buffers of the last picture size and is not safe to
         # use with another one, and nothing of one video may reach the next.
         slam = Slam(classical_priors(), self.preset.slam, self.device)
-        with torch.inference_mode():
+        with _typed_errors(source, report), torch.inference_mode():
             result = slam.run(source, report)
-        quality = assess(result, self.preset.slam, source.info.width)
+            quality = assess(result, self.preset.slam, source.info.width)
         timings = dict(result.timings_s)
         logger.info(
             "%s: %d frames, %d keyframes, reliable: %s %s",
@@ -107,7 +104,7 @@ class Annotator:
     def _provenance(self, source: FrameSource) -> Provenance:
         info = source.info
         return Provenance(
-            engine_version=importlib.metadata.version("vipe-cluster"),
+            engine_version=engine_version(),
             preset=self.preset.name,
             config_hash=self.preset.config_hash,
             device=describe_device(self.device, self.threads),
@@ -126,22 +123,58 @@ class Annotator:
         )
 
     def _dense(
-        self, source: FrameSource, result: SlamResult, timings: dict[str, float], report: Report
-    ) -> Iterator[DenseFrame]:
+        self, source: FrameSource, result: SlamResult, timings: dict[str, float], report: _Reporter
+    ) -> Generator[DenseFrame, None, None]:
         """Dense depth of every frame in order; the time spent in it, not in its consumer, is added to `timings`."""
         total = len(result.timestamps_s)
         spent_s = 0.0
-        stream = DenseDepth(self.preset.dense_depth).stream(source, _scene(result))
+        with _typed_errors(source, report):
+            stream = DenseDepth(self.preset.dense_depth).stream(source, _scene(result))
         with closing(stream) as frames:
             while True:
                 start_s = time.perf_counter()
-                frame = next(frames, None)
+                with _typed_errors(source, report):
+                    frame = next(frames, None)
                 spent_s += time.perf_counter() - start_s
                 timings["depth"] = spent_s
                 if frame is None:
                     return
                 yield DenseFrame(frame.index, frame.rgb, frame.depth, frame.confidence)
                 report("depth", frame.index + 1, total)
+
+
+class _Reporter:
+    """Passes progress on, and remembers what the callback raised: that is the caller's and goes back as it is."""
+
+    def __init__(self, callback: ProgressCallback | None) -> None:
+        self._callback = callback
+        self.raised: BaseException | None = None
+
+    def __call__(self, stage: str, done: int, total: int | None) -> None:
+        if self._callback is None:
+            return
+        try:
+            self._callback(Progress(stage, done, total))
+        except BaseException as error:
+            self.raised = error
+            raise
+
+
+@contextmanager
+def _typed_errors(source: FrameSource, report: _Reporter) -> Iterator[None]:
+    """Turns what a library threw into an EngineError; what memory, disks and the caller raise goes through."""
+    try:
+        yield
+    except (VipeError, MemoryError, OSError):
+        raise
+    except Exception as error:
+        if error is report.raised:
+            raise
+        logger.exception("%s: a stage failed", source.info.name)
+        first_line = (str(error) or "no message").splitlines()[0][:300]
+        raise EngineError(
+            f"{source.info.name}: {type(error).__name__}: {first_line}; please report it with the log"
+        ) from error
 
 
 def _scene(result: SlamResult) -> SceneMap:

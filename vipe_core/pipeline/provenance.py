@@ -1,4 +1,4 @@
-"""Versions of the libraries that a result depends on."""
+"""Versions of the engine and of the libraries that a result depends on."""
 
 from __future__ import annotations
 
@@ -6,6 +6,14 @@ import importlib.metadata
 import platform
 
 _LIBRARIES = ("torch", "numpy", "opencv-python-headless", "av", "poselib", "scipy", "numba")
+
+
+def engine_version() -> str:
+    """The installed version; `unknown` where the code is imported without being installed."""
+    try:
+        return importlib.metadata.version("vipe-cluster")
+    except importlib.metadata.PackageNotFoundError:
+        return "unknown"
 
 
 def library_versions() -> dict[str, str]:
