@@ -2,48 +2,13 @@
 
 from __future__ import annotations
 
-import contextlib
-import os
-import subprocess
-import sys
 from collections.abc import Iterator
-from dataclasses import dataclass
-from pathlib import Path
 
 import httpx
 import pytest
+from api_service import Service, running
 
 from services.store.sql import SqlStore
-
-ROOT = Path(__file__).resolve().parents[2]
-
-
-@dataclass
-class Service:
-    url: str
-    process: subprocess.Popen[str]
-    database_url: str
-
-
-@contextlib.contextmanager
-def running(database_url: str, *settings: str) -> Iterator[Service]:
-    process = subprocess.Popen(
-        [sys.executable, str(Path(__file__).with_name("api_process.py")), database_url, *settings],
-        stdout=subprocess.PIPE,
-        text=True,
-        cwd=ROOT,
-        env={**os.environ, "PYTHONPATH": str(ROOT)},
-    )
-    try:
-        assert process.stdout is not None
-        url = process.stdout.readline().strip()
-        assert url, f"the API did not start: {process.wait()}"
-        yield Service(url, process, database_url)
-    finally:
-        process.terminate()
-        process.wait(timeout=60)
-        assert process.stdout is not None
-        process.stdout.close()
 
 
 @pytest.fixture(scope="module")

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import os
+import subprocess
+import sys
 import threading
 import time
 from collections.abc import Iterator
@@ -12,7 +15,7 @@ from pathlib import Path
 import httpx
 import pytest
 from api_helpers import assert_problem, submit
-from conftest import Service, running
+from api_service import ROOT, Service, running
 from fastapi import FastAPI
 from openapi_spec_validator import validate
 from pydantic import SecretStr
@@ -213,6 +216,26 @@ def test_an_agent_that_has_no_worker_is_shown(tmp_path: Path) -> None:
         ready.set()
         assert httpx.get(f"{url}/readyz").json() == {"status": "ok", "agent": "ready"}
     store.close()
+
+
+def test_the_api_does_not_load_the_engine() -> None:
+    """What the engine computes with takes seconds to import; the first request must not pay for it."""
+    program = """
+import sys
+from services.api import create_app, create_server, offer
+from services.api.schemas import JobRequest
+offered = {"preset": offer.presets()[0], "camera": offer.cameras()[0]}
+JobRequest.model_validate({"inputs": ["/a"], "output": "/b", **offered})
+print(sorted({"torch", "numba", "cv2", "ray"} & set(sys.modules)))
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", program],
+        cwd=ROOT,
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+        capture_output=True,
+        text=True,
+    )
+    assert done.stdout.strip() == "[]", done.stderr
 
 
 def test_every_error_of_the_service_has_its_own_code() -> None:

@@ -11,7 +11,7 @@ from typing import Any
 
 import httpx
 from api_helpers import assert_problem, body, finish, plan, submit
-from conftest import Service, running
+from api_service import Service, running
 from sqlalchemy import create_engine, update
 
 from services.client import Client

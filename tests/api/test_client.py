@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 from api_helpers import body, finish, plan
-from conftest import Service, running
+from api_service import Service, running
 
 from services.client import ApiError, Client
 from services.domain.models import JobSpec
