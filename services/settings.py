@@ -47,14 +47,17 @@ class Settings(BaseSettings):
     input_roots: tuple[Path, ...] = ()
     """Local inputs must lie below one of these directories, symbolic links resolved; empty: anywhere. As JSON list."""
 
+    output_roots: tuple[Path, ...] = ()
+    """Local outputs must lie below one of these directories, symbolic links resolved; empty: anywhere. As JSON list."""
+
     s3_endpoint_url: str | None = None
     """S3 service other than AWS. Credentials come from where boto3 finds them."""
 
     ray_address: str | None = None
     """Address of a Ray cluster to join; None starts a private Ray on this machine."""
 
-    num_slots: int = Field(default_factory=lambda: min(4, os.cpu_count() or 1), ge=1)
-    """Worker processes of the agent, one video in each; default: one per core, 4 at most. On GPUs: as many as GPUs."""
+    num_slots: int | None = Field(default=None, ge=1)
+    """Worker processes of the agent, one video in each; default: one per GPU, without GPUs one per core, 4 at most."""
 
     device: Literal["cpu", "cuda"] = "cpu"
     """Where the engine runs."""
@@ -82,7 +85,7 @@ class Settings(BaseSettings):
     def _absolute(cls, value: Path) -> Path:
         return value.expanduser().absolute()
 
-    @field_validator("input_roots")
+    @field_validator("input_roots", "output_roots")
     @classmethod
     def _absolute_roots(cls, value: tuple[Path, ...]) -> tuple[Path, ...]:
         return tuple(root.expanduser().absolute() for root in value)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import json
 import zipfile
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from datetime import UTC, datetime
 from fractions import Fraction
 from pathlib import Path
@@ -14,8 +14,10 @@ import av
 import numpy as np
 import OpenEXR
 
+from services.commit import CommitOutcome, prepare_payload, write_record
 from services.domain.models import JobSpec, Lease, ShardPlan, VideoRef, VideoResult, shard_id
 from services.domain.states import VideoStatus
+from services.storage import ObjectStore
 
 WIDTH, HEIGHT = 16, 12
 JOB = "job_01test"
@@ -122,3 +124,15 @@ def failure(key: str, *, quarantined: bool = False, attempt: int = 1) -> VideoRe
         error_code="worker_died" if quarantined else "media_corrupt",
         error_message=f"/in/{key}.mp4 cannot be decoded; check the file",
     )
+
+
+def commit_shard(
+    lease: Lease,
+    results: Sequence[VideoResult],
+    artifacts_root: Path,
+    scratch: Path,
+    store: ObjectStore,
+    holds: Callable[[], bool],
+) -> CommitOutcome:
+    """Both steps of the protocol, one after the other."""
+    return write_record(store, prepare_payload(lease, results, artifacts_root, scratch, store), holds)

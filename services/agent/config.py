@@ -27,7 +27,7 @@ class AgentConfig:
     Attributes:
         scratch_dir: Node-local folder for inputs, artifacts and tars in the making. On a cluster: the same path on
             every node, each with its own contents.
-        slots: Worker processes; one video in each.
+        slots: Worker processes; one video in each. None: as many as the GPUs have room for, if `device` is `cuda`.
         device: Where the engine runs.
         gpus_per_slot: Share of a GPU that a slot reserves when `device` is `cuda`.
         cpus_per_slot: Cores that a slot reserves, and the threads its numeric libraries may use.
@@ -51,11 +51,12 @@ class AgentConfig:
         scratch_max_age_s: Leftovers of shards that nobody came back for are removed after this.
         engine: `module:callable` that opens an engine from (preset, camera, device).
         input_roots: Where local inputs must lie; empty: anywhere.
+        output_roots: Where local outputs must lie; empty: anywhere.
         s3_endpoint_url: S3 service other than AWS.
     """
 
     scratch_dir: Path
-    slots: int = 1
+    slots: int | None = 1
     device: Literal["cpu", "cuda"] = "cpu"
     gpus_per_slot: float = 1.0
     cpus_per_slot: int = 1
@@ -79,12 +80,17 @@ class AgentConfig:
     scratch_max_age_s: float = 86400.0
     engine: str = DEFAULT_ENGINE
     input_roots: tuple[Path, ...] = ()
+    output_roots: tuple[Path, ...] = ()
     s3_endpoint_url: str | None = None
     holder: str = field(default_factory=new_holder)
 
     def __post_init__(self) -> None:
-        if self.slots < 1:
+        if self.slots is not None and self.slots < 1:
             raise ValueError(f"slots must be at least 1, got {self.slots}")
+        if self.slots is None and self.device != "cuda":
+            raise ValueError("slots must be given where there are no GPUs to count")
+        if not self.gpus_per_slot > 0:
+            raise ValueError(f"gpus_per_slot must be positive, got {self.gpus_per_slot}")
         if self.lease_ttl_s <= 0:
             raise ValueError(f"lease_ttl_s must be positive, got {self.lease_ttl_s}")
         if not self.scratch_dir.is_absolute():
@@ -93,9 +99,12 @@ class AgentConfig:
 
 def config_from_settings(settings: Settings) -> AgentConfig:
     """What the service's settings say about its agent."""
+    slots = settings.num_slots
+    if slots is None and settings.device == "cpu":
+        slots = min(4, os.cpu_count() or 1)
     return AgentConfig(
         scratch_dir=settings.scratch_dir,
-        slots=settings.num_slots,
+        slots=slots,
         device=settings.device,
         ray_address=settings.ray_address,
         lease_ttl_s=settings.lease_ttl_s,
@@ -103,5 +112,6 @@ def config_from_settings(settings: Settings) -> AgentConfig:
         video_budget_per_frame_s=settings.video_timeout_per_frame_s,
         max_worker_deaths=settings.max_worker_deaths,
         input_roots=settings.input_roots,
+        output_roots=settings.output_roots,
         s3_endpoint_url=settings.s3_endpoint_url,
     )

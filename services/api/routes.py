@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path as FilePath
 from typing import Annotated
 
 from fastapi import APIRouter, Depends, Header, Path, Query, Request, Response
@@ -20,7 +21,7 @@ from services.api.schemas import (
     VideoPage,
     VideoView,
 )
-from services.domain.errors import JobNotFound
+from services.domain.errors import InvalidRequest, JobNotFound
 from services.domain.states import JobState, VideoStatus
 from services.store.base import Store
 
@@ -75,6 +76,7 @@ router = APIRouter(prefix="/v1/jobs", tags=["jobs"])
 def create_job(
     body: JobRequest,
     store: TheStore,
+    request: Request,
     response: Response,
     idempotency_key: Annotated[
         str | None,
@@ -82,11 +84,23 @@ def create_job(
     ] = None,
 ) -> JobView:
     """Create a job. Sent again with the same `Idempotency-Key` and body, it answers with the job of the first time."""
-    job, created = store.create_job(body.to_spec(), idempotency_key=idempotency_key)
+    spec = body.to_spec()
+    _check_output(spec.output, request.app.state.settings.output_roots)
+    job, created = store.create_job(spec, idempotency_key=idempotency_key)
     response.headers["Location"] = f"/v1/jobs/{job.id}"
     if not created:
         response.headers["Idempotent-Replayed"] = "true"
     return JobView.of(job)
+
+
+def _check_output(output: str, roots: tuple[FilePath, ...]) -> None:
+    """Refuse at once what planning would refuse later."""
+    if not roots or not output.startswith("/"):
+        return
+    from services.storage.roots import lies_within  # The storage clients behind it are slow to import.
+
+    if not lies_within(output, roots):
+        raise InvalidRequest(f"output {output} lies outside of the directories that this service may write")
 
 
 @router.get("", responses=responses(400, 401, 422, 503))

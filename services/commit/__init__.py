@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from services.commit.gc import GcReport, collect_garbage
 from services.commit.layout import ATTRIBUTES, attributes_of, commit_key, payload_key
-from services.commit.protocol import CommitOutcome, PreparedPayload, commit_shard, prepare_payload, write_record
+from services.commit.protocol import CommitOutcome, PreparedPayload, prepare_payload, write_record
 from services.commit.reconcile import committed_record, committed_records
 
 __all__ = [
@@ -15,7 +15,6 @@ __all__ = [
     "attributes_of",
     "collect_garbage",
     "commit_key",
-    "commit_shard",
     "committed_record",
     "committed_records",
     "payload_key",

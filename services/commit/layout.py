@@ -17,6 +17,7 @@ from services.domain.errors import IntegrityError
 from services.domain.models import Attribute
 
 ATTRIBUTES: tuple[Attribute, ...] = get_args(Attribute)
+FOLDERS = ("payload/", "_commits/", "_claims/")
 REQUIRED: tuple[Attribute, ...] = ("pose", "intrinsics")
 
 

@@ -82,20 +82,6 @@ class CommitOutcome:
     record: CommitRecord | None
 
 
-def commit_shard(
-    lease: Lease,
-    results: Sequence[VideoResult],
-    artifacts_root: Path,
-    scratch: Path,
-    store: ObjectStore,
-    holds: Callable[[], bool],
-    *,
-    prefix: str = DEFAULT_PREFIX,
-) -> CommitOutcome:
-    """Both steps in one process; see `prepare_payload` and `write_record`."""
-    return write_record(store, prepare_payload(lease, results, artifacts_root, scratch, store, prefix=prefix), holds)
-
-
 def prepare_payload(
     lease: Lease,
     results: Sequence[VideoResult],

@@ -31,7 +31,7 @@ from services.dataset.schema import (
     meta_schema,
     public_spec,
 )
-from services.domain.errors import IntegrityError, ObjectMissing
+from services.domain.errors import IntegrityError
 from services.domain.models import CommitRecord, JobSpec
 from services.domain.states import VideoStatus
 from services.storage.base import ObjectStore
@@ -161,8 +161,6 @@ def finalise(
         }
         _write_dataset_json(folder / DATASET_KEY, description, folder / "shards")
         (folder / CARD_KEY).write_text(dataset_card(job_id, spec, asdict(totals)), encoding="utf-8")
-        if _described_job(store) not in (None, job_id):
-            store.delete(DATASET_KEY)  # of a job that was cancelled: it must not vouch for what follows
         for key in (META_KEY, FAILURES_KEY, CARD_KEY, DATASET_KEY):
             store.put_file(key, folder / key)
     return totals
@@ -216,12 +214,3 @@ def _write_dataset_json(path: Path, description: dict[str, Any], shards: Path) -
         out.write(f'{head},\n "shards": [\n')
         shutil.copyfileobj(lines, out)
         out.write("\n]}\n")
-
-
-def _described_job(store: ObjectStore) -> str | None:
-    try:
-        return str(json.loads(store.get_bytes(DATASET_KEY))["job_id"])
-    except ObjectMissing:
-        return None
-    except (ValueError, KeyError, TypeError):
-        return ""

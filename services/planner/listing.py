@@ -10,6 +10,7 @@ from pathlib import Path
 
 from services.domain.errors import InputUnavailable, ObjectMissing
 from services.storage.open import open_store
+from services.storage.roots import lies_within
 
 VIDEO_EXTENSIONS = frozenset(
     {".mp4", ".mov", ".mkv", ".webm", ".avi", ".m4v", ".mpg", ".mpeg", ".ts", ".gif"},
@@ -79,7 +80,7 @@ def _expand_local(uri: str, input_roots: Sequence[Path]) -> Iterator[Found]:
     except (OSError, RuntimeError) as error:
         reason = "it does not exist" if isinstance(error, FileNotFoundError) else str(error)
         raise InputUnavailable(f"cannot read input {uri}: {reason}") from error
-    if input_roots and not any(resolved.is_relative_to(root.resolve()) for root in input_roots):
+    if not lies_within(resolved, input_roots):
         raise InputUnavailable(f"input {uri} lies outside of the directories that this service may read")
     if stat.S_ISREG(status.st_mode):
         yield Found(str(path), status.st_size)

@@ -17,12 +17,20 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TypeVar
 
-from services.domain.errors import OutputInUse, OutputUnsupported, ServiceError, StoreUnavailable, code_and_message
+from services.domain.errors import (
+    OutputInUse,
+    OutputUnsupported,
+    ServiceError,
+    StorageRefused,
+    StoreUnavailable,
+    code_and_message,
+)
 from services.domain.models import Job, ShardPlan
 from services.planner.listing import Found, expand
 from services.planner.packing import SeenVideos, new_videos, pack
 from services.storage.base import ObjectStore
 from services.storage.open import open_store, supports_create_once
+from services.storage.roots import lies_within
 from services.store.base import Store, VideoRow
 
 CLAIM_KEY = "_job.json"
@@ -39,6 +47,7 @@ def plan_next(
     *,
     ttl_s: float = 60.0,
     input_roots: Sequence[Path] = (),
+    output_roots: Sequence[Path] = (),
     s3_endpoint_url: str | None = None,
     give_up_after_s: float = 120.0,
     backoff_base_s: float = 1.0,
@@ -51,6 +60,7 @@ def plan_next(
         holder: Who plans: a name that no other planner ever has.
         ttl_s: Another planner takes over what nothing was heard of for so long.
         input_roots: Where local inputs must lie; empty: anywhere.
+        output_roots: Where local outputs must lie; empty: anywhere.
         s3_endpoint_url: S3 service other than AWS.
         give_up_after_s: For how long a job is tried again whose planning fails for reasons that can pass, storage that
             does not answer or a defect. It waits meanwhile, and other jobs have their turn.
@@ -70,7 +80,7 @@ def plan_next(
         return True
     turn = Turn(store, job.id, fence, ttl_s)
     try:
-        plan(turn, input_roots=input_roots, s3_endpoint_url=s3_endpoint_url)
+        plan(turn, input_roots=input_roots, output_roots=output_roots, s3_endpoint_url=s3_endpoint_url)
     except StoreUnavailable:
         raise
     except Exception as error:
@@ -129,16 +139,24 @@ class Turn:
         return self.store.finish_planning(self.job_id, self.fence)
 
 
-def plan(turn: Turn, *, input_roots: Sequence[Path] = (), s3_endpoint_url: str | None = None) -> None:
+def plan(
+    turn: Turn,
+    *,
+    input_roots: Sequence[Path] = (),
+    output_roots: Sequence[Path] = (),
+    s3_endpoint_url: str | None = None,
+) -> None:
     """Write the shards of a job. Stops if it is cancelled meanwhile, or another planner's turn.
 
     Raises:
         InputUnavailable: An input does not exist or holds no video.
-        OutputInUse: The output belongs to another job.
+        OutputInUse: The output belongs to another job, or holds files that the job would replace.
+        StorageRefused: The output lies outside of the directories that the service may write.
         OutputUnsupported: The output's storage cannot decide between two writers.
         StorageError: Storage does not answer.
     """
     job = turn.store.get_job(turn.job_id)  # Not before the turn began: from now on nobody else adds shards.
+    check_output_place(job.spec.output, output_roots)
     with SeenVideos() as seen:
         for row in turn.keep(_planned(job, turn.store)):
             seen.add(row.ref.key, row.ref.uri)
@@ -158,18 +176,27 @@ def plan(turn: Turn, *, input_roots: Sequence[Path] = (), s3_endpoint_url: str |
         turn.finish()
 
 
+def check_output_place(output: str, roots: Sequence[Path]) -> None:
+    """Raises StorageRefused if a local output lies outside of `roots`; no roots: anywhere."""
+    if output.startswith("/") and not lies_within(output, roots):
+        raise StorageRefused(f"output {output} lies outside of the directories that this service may write")
+
+
 def claim_output(output: ObjectStore, job_id: str) -> None:
     """Write a job's name into its output, once. Idempotent for the same job.
 
     Raises:
-        OutputInUse: Another job's name is there.
+        OutputInUse: Another job's name is there; or no job's, but files that this job would replace or mix with.
         OutputUnsupported: The storage lets a second writer replace what the first one created.
         StorageError: The output cannot be written.
     """
-    if output.head(CLAIM_KEY) is None and not supports_create_once(output):
-        raise OutputUnsupported(
-            f"the storage of {output.uri} ignores create-once writes (If-None-Match); use another output"
-        )
+    if output.head(CLAIM_KEY) is None:
+        if (taken := _taken_key(output)) is not None:
+            raise OutputInUse(f"output {output.uri} holds {taken} already, which is not ours; choose another folder")
+        if not supports_create_once(output):
+            raise OutputUnsupported(
+                f"the storage of {output.uri} ignores create-once writes (If-None-Match); use another output"
+            )
     document = json.dumps({"schema_version": 1, "job_id": job_id}, sort_keys=True) + "\n"
     if output.create(CLAIM_KEY, document.encode()):
         return
@@ -180,6 +207,17 @@ def claim_output(output: ObjectStore, job_id: str) -> None:
     if owner != job_id:
         name = f"job {owner}" if owner else "something else"
         raise OutputInUse(f"output {output.uri} belongs to {name} ({CLAIM_KEY}); choose another output")
+
+
+def _taken_key(output: ObjectStore) -> str | None:
+    """A key of the kind that a job writes and that lies in the output already: a README.md of the user's own, say."""
+    from services.commit.layout import FOLDERS  # Heavy packages stand behind these two.
+    from services.dataset.schema import CARD_KEY, DATASET_KEY, FAILURES_KEY, META_KEY
+
+    for key in (META_KEY, FAILURES_KEY, DATASET_KEY, CARD_KEY):
+        if output.head(key) is not None:
+            return key
+    return next((info.key for folder in FOLDERS for info in output.list(folder)), None)
 
 
 def _expand_all(inputs: Sequence[str], roots: Sequence[Path], s3_endpoint_url: str | None) -> Iterator[Found]:

@@ -13,13 +13,23 @@ import numpy as np
 import OpenEXR
 import pytest
 import webdataset
-from shard_factory import HEIGHT, JOB, WIDTH, depth_of, failure, make_lease, poses_of, success, write_artifacts
+from shard_factory import (
+    HEIGHT,
+    JOB,
+    WIDTH,
+    commit_shard,
+    depth_of,
+    failure,
+    make_lease,
+    poses_of,
+    success,
+    write_artifacts,
+)
 
 from services.commit import (
     PreparedPayload,
     collect_garbage,
     commit_key,
-    commit_shard,
     committed_record,
     committed_records,
     prepare_payload,

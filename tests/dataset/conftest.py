@@ -9,9 +9,8 @@ from pathlib import Path
 
 import boto3
 import pytest
-from shard_factory import JOB, failure, make_lease, success, write_artifacts
+from shard_factory import JOB, commit_shard, failure, make_lease, success, write_artifacts
 
-from services.commit import commit_shard
 from services.dataset import finalise
 from services.domain.models import JobSpec
 from services.storage import DirectoryStore, ObjectStore, S3Store

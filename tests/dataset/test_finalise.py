@@ -10,9 +10,9 @@ from pathlib import Path
 import pyarrow.parquet as pq
 import pytest
 import yaml
-from shard_factory import JOB, make_lease, success
+from shard_factory import JOB, commit_shard, make_lease, success
 
-from services.commit import commit_shard, committed_records
+from services.commit import committed_records
 from services.dataset import finalise
 from services.dataset.schema import meta_schema, public_spec, public_uri
 from services.domain.errors import IntegrityError
@@ -152,17 +152,6 @@ def test_a_payload_that_is_not_there_is_refused(committed: DirectoryStore, damag
         committed.put_bytes(key, committed.get_bytes(key)[:-512])
     with pytest.raises(IntegrityError, match=key):
         finalise(committed, JOB, SPEC, num_shards=3)
-
-
-def test_the_description_of_a_cancelled_job_does_not_survive(committed: DirectoryStore) -> None:
-    class Dies(DirectoryStore):
-        def put_file(self, key: str, path: Path):
-            raise KeyboardInterrupt
-
-    committed.put_bytes("dataset.json", b'{"job_id": "job_earlier"}')
-    with pytest.raises(KeyboardInterrupt):
-        finalise(Dies(committed.uri), JOB, SPEC, num_shards=3)
-    assert committed.head("dataset.json") is None
 
 
 @pytest.mark.parametrize(

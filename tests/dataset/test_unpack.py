@@ -9,9 +9,8 @@ from pathlib import Path
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from shard_factory import JOB, make_lease, success, write_artifacts
+from shard_factory import JOB, commit_shard, make_lease, success, write_artifacts
 
-from services.commit import commit_shard
 from services.dataset import finalise, unpack
 from services.domain.errors import IntegrityError, ObjectMissing
 from services.domain.models import JobSpec, VideoResult

@@ -319,6 +319,35 @@ class TestJobs:
         job = store.get_job(job_id)
         assert (job.state, job.error_code) == (JobState.FAILED, "storage_refused")
 
+    @pytest.mark.parametrize("name", ["README.md", "meta.parquet", "dataset.json", "payload/mine/notes.txt"])
+    def test_files_of_the_user_are_not_replaced(self, store: SqlStore, videos: Path, tmp_path: Path, name: str) -> None:
+        make(videos, "a.mp4")
+        make(tmp_path / "out", "other.txt", name)
+        job_id = submit(store, tmp_path / "out", videos)
+        assert plan_next(store, "planner")
+        job = store.get_job(job_id)
+        assert (job.state, job.error_code) == (JobState.FAILED, "output_in_use")
+        assert name in str(job.error_message)
+        assert not (tmp_path / "out" / CLAIM_KEY).exists()
+        (tmp_path / "out" / name).unlink()
+        again = submit(store, tmp_path / "out", videos)
+        assert plan_next(store, "planner")
+        assert store.get_job(again).planned
+
+    def test_outputs_lie_where_the_service_may_write(self, store: SqlStore, videos: Path, tmp_path: Path) -> None:
+        make(videos, "a.mp4")
+        allowed = tmp_path / "allowed"
+        allowed.mkdir()
+        (allowed / "link").symlink_to(tmp_path)
+        inside, outside, through_a_link = (
+            submit(store, output, videos) for output in (allowed / "new" / "out", tmp_path / "out", allowed / "link/x")
+        )
+        for _ in range(3):
+            assert plan_next(store, "planner", output_roots=[allowed])
+        assert store.get_job(inside).planned
+        for job_id in (outside, through_a_link):
+            assert store.get_job(job_id).error_code == "storage_refused"
+
     @pytest.mark.parametrize(
         ("error", "code"), [(StorageError("slow down"), "storage_error"), (ZeroDivisionError("oops"), "internal_error")]
     )
