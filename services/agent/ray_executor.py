@@ -30,7 +30,7 @@ from services.agent.executor import Died, SlotHandle
 from services.agent.messages import Failed, Reply, SlotProgress, Task
 from services.agent.slot import Slot, SlotConfig
 from services.observability.logging import configure_logging
-from vipe_core.errors import EngineError
+from vipe_core.errors import ConfigError, EngineError
 
 logger = logging.getLogger(__name__)
 
@@ -108,7 +108,12 @@ class RaySlot:
             # Finished artifacts lie on the node of the last process.
             options["scheduling_strategy"] = NodeAffinitySchedulingStrategy(self._node_id, soft=True)
         slot_config = SlotConfig(
-            config.scratch_dir, config.device, config.engine, config.s3_endpoint_url, config.scratch_max_age_s
+            config.scratch_dir,
+            config.device,
+            config.engine,
+            config.s3_endpoint_url,
+            config.scratch_max_age_s,
+            config.input_roots,
         )
         level = logging.getLevelName(logging.getLogger().getEffectiveLevel())
         try:
@@ -189,11 +194,17 @@ class RaySlot:
 
 
 class RayExecutor:
-    """An `Executor` on Ray."""
+    """An `Executor` on Ray.
+
+    Raises:
+        ConfigError: The machine has not the GPUs for the slots.
+    """
 
     def __init__(self, config: AgentConfig) -> None:
         self._config = config
         self._private = config.ray_address is None
+        # Asked here and not in `start`, which is tried again and again: too many slots will not fit later either.
+        self._num_slots = slots_on_this_machine(config) if self._private else config.slots
         self._temp_dir: Path | None = None
         self._actor_class: Any = None
         self._slots: list[RaySlot] = []
@@ -206,7 +217,7 @@ class RayExecutor:
         """
         self._connect()
         self._slots = [
-            RaySlot(lambda: self._actor_class, self._config, private=self._private) for _ in range(self._config.slots)
+            RaySlot(lambda: self._actor_class, self._config, private=self._private) for _ in range(self._num_slots or 1)
         ]
 
     def restart(self) -> None:
@@ -222,6 +233,15 @@ class RayExecutor:
         self._slots = []
 
     def _connect(self) -> None:
+        """Start or join Ray; what is half started when that fails is ended."""
+        try:
+            self._connect_or_raise()
+        except BaseException:
+            with contextlib.suppress(Exception):
+                self._disconnect()
+            raise
+
+    def _connect_or_raise(self) -> None:
         started = time.monotonic()
         if self._private:
             self._start_private()
@@ -234,6 +254,8 @@ class RayExecutor:
                 log_to_driver=False,
                 configure_logging=False,
             )
+            if self._num_slots is None:
+                self._num_slots = self._slots_on_the_cluster()
         self._actor_class = self._new_actor_class()
         logger.info("Ray is ready after %.1f s", time.monotonic() - started)
 
@@ -246,6 +268,20 @@ class RayExecutor:
         if self._temp_dir is not None:
             shutil.rmtree(self._temp_dir, ignore_errors=True)
 
+    def _slots_on_the_cluster(self) -> int:
+        """As many slots as its GPUs have room for now.
+
+        Raises:
+            ConnectionError: No GPU has joined it yet.
+        """
+        import ray
+
+        gpus = float(ray.cluster_resources().get("GPU", 0))
+        number = math.floor(gpus / self._config.gpus_per_slot + 1e-6)
+        if number < 1:
+            raise ConnectionError("the Ray cluster has no GPU yet; wait for its nodes, or set the number of slots")
+        return number
+
     def _start_private(self) -> None:
         config = self._config
         os.environ.update(_PRIVATE_ENVIRONMENT)  # Before Ray is imported: it reads some of these only then.
@@ -256,12 +292,13 @@ class RayExecutor:
         import ray
 
         self._temp_dir = private_temp_dir(config.scratch_dir.parent)
-        gpus = math.ceil(config.slots * config.gpus_per_slot) if config.device == "cuda" else 0
+        slots = self._num_slots or 1
+        gpus = math.ceil(slots * config.gpus_per_slot) if config.device == "cuda" else 0
         logging.getLogger("ray").setLevel(logging.ERROR)  # It warns about every thread that is not the main one.
         with _environment(self._worker_environment()):  # Workers inherit it, which is faster than a runtime_env.
             ray.init(
                 address="local",
-                num_cpus=config.slots * config.cpus_per_slot,
+                num_cpus=slots * config.cpus_per_slot,
                 num_gpus=gpus,
                 object_store_memory=_OBJECT_STORE_BYTES,
                 include_dashboard=False,
@@ -290,6 +327,33 @@ class RayExecutor:
             concurrency_groups={"control": 2},
             runtime_env=None if self._private else {"env_vars": self._worker_environment()},
         )(SlotActor)
+
+
+def slots_on_this_machine(config: AgentConfig) -> int:
+    """The number of slots, that of the GPUs' shares if none is given.
+
+    Raises:
+        ConfigError: There is no GPU, or there are fewer than the slots need.
+    """
+    if config.device != "cuda":
+        return config.slots or 1
+    gpus = count_gpus()
+    room = math.floor(gpus / config.gpus_per_slot + 1e-6)
+    if room < 1:
+        raise ConfigError("there is no GPU for device 'cuda'; use device 'cpu', or check the driver")
+    if config.slots is not None and config.slots > room:
+        raise ConfigError(
+            f"{config.slots} slots need {config.slots * config.gpus_per_slot:g} GPUs, this machine has {gpus}; "
+            f"set the number of slots to {room} at most"
+        )
+    return config.slots or room
+
+
+def count_gpus() -> int:
+    """The CUDA devices that this process may use."""
+    import torch  # Slow to import, and of no use to a process without GPUs.
+
+    return torch.cuda.device_count()
 
 
 @contextlib.contextmanager

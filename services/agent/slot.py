@@ -37,6 +37,7 @@ from services.domain.errors import InputUnavailable, ObjectMissing, ServiceError
 from services.domain.models import VideoRef, VideoResult
 from services.domain.states import VideoStatus
 from services.storage import open_store
+from services.storage.roots import lies_within
 from vipe_core.errors import EngineError, VipeError
 
 logger = logging.getLogger(__name__)
@@ -51,6 +52,7 @@ class SlotConfig:
     engine: str
     s3_endpoint_url: str | None
     scratch_max_age_s: float
+    input_roots: tuple[Path, ...] = ()
 
 
 class _Interrupted(BaseException):
@@ -181,7 +183,10 @@ class Slot:
     def _fetch(self, video: VideoRef, scratch: ShardScratch) -> tuple[Path, float]:
         """A local path of the input, and the seconds that it took to get it."""
         if not video.uri.startswith("s3://"):
-            return Path(video.uri.removeprefix("file://")), 0.0
+            if not lies_within(video.uri, self._config.input_roots):
+                # It was listed inside, so somebody has put a link in its place.
+                raise InputUnavailable(f"{video.uri} lies outside of the directories that this service may read")
+            return Path(video.uri), 0.0
         started = time.perf_counter()
         bucket, _, key = video.uri.removeprefix("s3://").partition("/")
         store = open_store(f"s3://{bucket}", endpoint_url=self._config.s3_endpoint_url, observer=self._traffic)

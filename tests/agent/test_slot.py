@@ -55,6 +55,21 @@ def _run(slot: Slot, lease: Lease) -> list[Reply]:
     return [*replies, slot.run(PackShard(lease, results))]
 
 
+def test_an_input_that_became_a_link_out_of_its_roots_is_not_read(rig: Rig, tmp_path: Path) -> None:
+    rig.job({"a": "frames=3"})
+    lease = rig.lease().lease
+    secret = tmp_path / "secret.mp4"
+    secret.write_text("frames=3")
+    path = Path(lease.videos[0].uri)
+    slot = Slot(replace(_config(tmp_path), input_roots=(path.parent,)))
+    assert isinstance(slot.run(OpenShard(lease)).answer, Opened)
+    path.unlink()
+    path.symlink_to(secret)
+    answer = slot.run(AnnotateVideo(lease, lease.videos[0])).answer
+    assert isinstance(answer, Failed)
+    assert (answer.code, answer.retryable, answer.scope) == ("input_unavailable", False, "video")
+
+
 def test_s3_to_s3_and_the_traffic_is_reported(rig: Rig, bucket: str, s3_endpoint: str) -> None:
     client = boto3.client("s3", endpoint_url=s3_endpoint)
     client.put_object(Bucket=bucket, Key="in/a clip.mp4", Body=b"frames=3")

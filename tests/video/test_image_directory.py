@@ -107,3 +107,14 @@ def test_no_images_no_directory_and_limits(tmp_path: Path) -> None:
         open_source(tmp_path, limits=Limits(max_frames=1))
     with pytest.raises(MediaTooLarge):
         open_source(tmp_path, limits=Limits(max_pixels=1000))
+
+
+def test_links_out_of_the_directory_are_skipped(tmp_path: Path) -> None:
+    folder, elsewhere = tmp_path / "frames", tmp_path / "elsewhere"
+    folder.mkdir()
+    elsewhere.mkdir()
+    save(folder / "1.png", picture(1, 90, 60))
+    save(elsewhere / "secret.png", picture(2, 90, 60))
+    (folder / "2.png").symlink_to(elsewhere / "secret.png")
+    (folder / "3.png").symlink_to("1.png")
+    assert [number_of(frame.rgb) for frame in open_source(folder).frames()] == [1, 1]
