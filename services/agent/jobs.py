@@ -20,6 +20,7 @@ from services.store.base import Store
 logger = logging.getLogger(__name__)
 
 _FINALISE_TRIES = 8
+_SWEEP_TRIES = 8
 
 
 class JobKeeper:
@@ -42,10 +43,10 @@ class JobKeeper:
         self._plan_after_s = 0.0
 
     def step(self) -> bool:
-        """Plan a job and finalise a job, where there is one; whether anything was done. Never raises."""
+        """Plan a job and finalise a job, or tidy up after one; whether anything was done. Never raises."""
         planned = self._plan()
         finalised = self._finalise()
-        return planned or finalised
+        return planned or finalised or self._sweep()
 
     def reconcile(self) -> None:
         """Let the database learn what running jobs have in their output that it missed. Never raises."""
@@ -73,6 +74,7 @@ class JobKeeper:
                 self._config.holder,
                 ttl_s=self._config.lease_ttl_s,
                 input_roots=self._config.input_roots,
+                output_roots=self._config.output_roots,
                 s3_endpoint_url=self._config.s3_endpoint_url,
                 backoff_base_s=self._config.backoff_base_s,
                 backoff_max_s=self._config.backoff_max_s,
@@ -138,6 +140,39 @@ class JobKeeper:
             self._store.fail_job(job.id, *code_and_message(error))
         except Exception as second:
             logger.warning("could not say that finalising failed: %s", second)
+
+    def _sweep(self) -> bool:
+        """Remove what attempts that crashed or came second left in the output of a job that has ended.
+
+        Best effort: the job is what it is, and an output that does not answer in the end keeps its rubbish.
+        """
+        try:
+            job = self._store.next_unswept(quiet_s=2 * self._config.lease_ttl_s)
+            if job is None:
+                return False
+            with context(job=job.id):
+                if not self._swept(job):
+                    return False
+                self._store.finish_sweep(job.id)
+        except Exception as error:
+            logger.warning("could not look for outputs to tidy up: %s", error)
+            return False
+        return True
+
+    def _swept(self, job: Job) -> bool:
+        """Whether this job is done with."""
+        try:
+            from services.commit.gc import collect_garbage  # Slow to import; see `services.agent.commits`.
+
+            abandoned = job.state in (JobState.FAILED, JobState.CANCELLED)
+            collect_garbage(self._committer.output(job.spec.output), job.id, abandoned=abandoned)
+        except Exception as error:
+            deferral = self._store.defer_job(
+                job.id, base_s=self._config.backoff_base_s, max_s=self._config.backoff_max_s
+            )
+            logger.warning("could not tidy up the output of %s: %s", job.id, error)
+            return deferral.failures >= _SWEEP_TRIES
+        return True
 
     def _backoff(self) -> Backoff:
         return Backoff(self._config.backoff_base_s, self._config.backoff_max_s)

@@ -11,8 +11,12 @@ from services.commit.layout import claim_key
 from services.commit.reconcile import committed_records
 from services.domain.errors import ObjectMissing
 from services.storage.base import ObjectInfo, ObjectStore
+from services.storage.directory import DirectoryStore
 
 logger = logging.getLogger(__name__)
+
+# No write takes so long; what is older is of a process that died.
+_STALE_TEMPORARY_S = 86_400.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,7 +29,7 @@ class GcReport:
 
 
 def collect_garbage(store: ObjectStore, job_id: str, *, abandoned: bool = False) -> GcReport:
-    """Delete the payload of a job that no record refers to.
+    """Delete the payload of a job that no record refers to, and in a directory the unfinished files of dead writers.
 
     Touches only tar names that this job claimed, and only of shards that have a record: such a shard's other attempts
     can never commit any more. So it is safe beside running agents, and harmless to repeat.
@@ -34,6 +38,8 @@ def collect_garbage(store: ObjectStore, job_id: str, *, abandoned: bool = False)
         abandoned: Also delete payload of shards without a record. Only for a cancelled or failed job that no agent can
             hold a lease of any more.
     """
+    if isinstance(store, DirectoryStore):
+        store.delete_stale_temporaries(_STALE_TEMPORARY_S)
     settled: set[str] = set()
     referenced: set[str] = set()
     for record in committed_records(store, job_id):

@@ -7,6 +7,7 @@ import errno
 import os
 import secrets
 import shutil
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import BinaryIO, cast
@@ -112,6 +113,23 @@ class DirectoryStore:
                     target.unlink()
                     _flush_folder(target.parent)
             self._observer.request("delete", "200")
+
+    def delete_stale_temporaries(self, older_than_s: float) -> int:
+        """Remove what writers that died left behind; returns how many files.
+
+        Args:
+            older_than_s: What was written to more recently may have a live writer.
+        """
+        removed = 0
+        before_s = time.time() - older_than_s
+        with self._mapped("delete", ""):
+            for folder, _, names in os.walk(self._root):
+                for name in names:
+                    path = Path(folder, name)
+                    if name.startswith(TEMPORARY_PREFIX) and path.lstat().st_mtime < before_s:
+                        path.unlink(missing_ok=True)
+                        removed += 1
+        return removed
 
     def _put(self, key: str, write: Callable[[BinaryIO], object]) -> ObjectInfo:
         with self._mapped("put", key):

@@ -170,6 +170,17 @@ class Store(Protocol):
     def finish_job(self, job_id: str) -> Job:
         """Finalizing -> succeeded, or succeeded_with_errors if any video failed."""
 
+    # Tidying --------------------------------------------------------------------------------------------------------
+    def next_unswept(self, *, quiet_s: float) -> Job | None:
+        """The oldest job with shards that has ended and whose output was not rid of rubbish yet.
+
+        A job that failed or was cancelled comes only once no lease of it is live and nothing was heard of one for
+        `quiet_s`. Jobs that wait are left out.
+        """
+
+    def finish_sweep(self, job_id: str) -> None:
+        """`next_unswept` names this job no more."""
+
     # Reading --------------------------------------------------------------------------------------------------------
     def list_videos(
         self,

@@ -204,6 +204,12 @@ def finish_job(tx: Tx, job_id: str) -> None:
     move_job(tx, job, JobState.SUCCEEDED_WITH_ERRORS if with_errors else JobState.SUCCEEDED, event_data=counts)
 
 
+def finish_sweep(tx: Tx, job_id: str) -> None:
+    """See `Store.finish_sweep`."""
+    lock_job(tx, job_id)
+    tx.run(update(jobs).where(jobs.c.id == job_id).values(swept=True, **NO_FAILURES))
+
+
 def _cancel_pending(tx: Tx, job_id: str) -> None:
     tx.run(
         update(shards)

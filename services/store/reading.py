@@ -5,7 +5,7 @@ from __future__ import annotations
 from datetime import datetime, timedelta
 from typing import Any
 
-from sqlalchemy import ColumnElement, Row, Select, and_, func, or_, select
+from sqlalchemy import ColumnElement, Row, Select, and_, exists, func, or_, select
 
 from services.domain.errors import InvalidPageToken, JobNotFound
 from services.domain.models import (
@@ -63,6 +63,17 @@ def finalizable(now: datetime) -> Select[Any]:
         jobs.c.state == JobState.RUNNING.value, jobs.c.planned, jobs.c.shards_committed == jobs.c.shards_total
     )
     return select(jobs).where(or_(jobs.c.state == JobState.FINALIZING.value, settled), _has_its_turn(now))
+
+
+def unswept(now: datetime, quiet_s: float) -> Select[Any]:
+    since = now - timedelta(seconds=quiet_s)
+    heard_of = exists().where(
+        shards.c.job_id == jobs.c.id, or_(in_state(shards.c.state, ShardState.LEASED), shards.c.renewed_at > since)
+    )
+    complete = jobs.c.state.in_([JobState.SUCCEEDED, JobState.SUCCEEDED_WITH_ERRORS])
+    abandoned = and_(jobs.c.state.in_([JobState.FAILED, JobState.CANCELLED]), jobs.c.finished_at <= since, ~heard_of)
+    open_jobs = select(jobs).where(~jobs.c.swept, jobs.c.shards_total > 0, _has_its_turn(now))
+    return open_jobs.where(or_(complete, abandoned))
 
 
 def _has_its_turn(now: datetime) -> ColumnElement[bool]:

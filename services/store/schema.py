@@ -102,6 +102,7 @@ jobs = Table(
     Column("updated_at", UtcDateTime, nullable=False),
     Column("started_at", UtcDateTime),
     Column("finished_at", UtcDateTime),
+    Column("swept", Boolean, nullable=False, server_default=text("false")),  # its output is rid of rubbish
     # Counters, kept by the transactions that change what they count.
     _count("shards_total"),
     _count("shards_committed"),
@@ -112,6 +113,7 @@ jobs = Table(
     _count("frames_committed"),
     _one_of("state", JobState),
     Index("ix_jobs_state_id", "state", "id"),
+    Index("ix_jobs_unswept", "id", sqlite_where=text("swept = 0"), postgresql_where=text("NOT swept")),
     # An output belongs to one job; one that ended before it had shards has left no trace in it.
     Index(
         "uq_jobs_output_owner",

@@ -123,6 +123,13 @@ class SqlStore:
         self._db.write(lambda tx: jobs.finish_job(tx, job_id))
         return self.get_job(job_id)
 
+    # Tidying --------------------------------------------------------------------------------------------------------
+    def next_unswept(self, *, quiet_s: float) -> Job | None:
+        return self._db.read(lambda tx: reading.first_job(tx, reading.unswept(tx.now, quiet_s)))
+
+    def finish_sweep(self, job_id: str) -> None:
+        self._db.write(lambda tx: jobs.finish_sweep(tx, job_id))
+
     # Reading --------------------------------------------------------------------------------------------------------
     def list_videos(
         self,

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import os
 import threading
 import time
 from collections import Counter
@@ -193,6 +195,45 @@ def test_a_job_whose_output_is_down_keeps_no_slot_from_the_others(
     good = world.submit("good", {f"v{n}": "frames=2" for n in range(6)}, shard_max_videos=1)
     assert world.ended(good) is JobState.SUCCEEDED
     assert world.store.get_job(broken).state is JobState.RUNNING
+
+
+def test_rubbish_goes_when_a_job_has_ended(world: World) -> None:
+    """A payload that an attempt uploaded before it died, and the half-written file of a writer that died."""
+    done, failed = (world.submit(name, {"a": "frames=3"}) for name in ("done", "failed"))
+    assert plan_next(world.store, "planner")
+    assert plan_next(world.store, "planner")
+    leases = world.store.claim("dead agent", limit=2, ttl_s=60)
+    for lease in leases:
+        output = open_store(lease.spec.output)
+        output.put_bytes(
+            "_claims/vipe-0badbeef.json", json.dumps({"job_id": lease.job_id, "shard_id": lease.shard_id}).encode()
+        )
+        output.put_bytes("payload/vipe-0badbeef/pose.tar", b"half of the work")
+        temporary = Path(lease.spec.output, "payload", ".vipe-tmp-1-2")
+        temporary.write_bytes(b"")
+        os.utime(temporary, (0, 0))
+        world.store.release(lease.shard_id, lease.fence, "died")
+    world.store.fail_job(failed, "storage_refused", "no more space")
+    world.agent.start()
+    assert world.ended(done) is JobState.SUCCEEDED
+    for job_id in (done, failed):
+        folder = Path(world.store.get_job(job_id).spec.output, "payload")
+        world.wait(lambda at=folder: not (at / "vipe-0badbeef" / "pose.tar").exists(), "the payload to go")  # type: ignore[misc]
+        assert not (folder / ".vipe-tmp-1-2").exists()
+    world.wait(lambda: world.store.next_unswept(quiet_s=0) is None, "both to be done with")
+    assert len(list(Path(world.store.get_job(done).spec.output, "payload").glob("*/pose.tar"))) == 1
+
+
+def test_an_output_that_cannot_be_tidied_up_harms_no_job(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
+    def broken(*_: object, **__: object) -> None:
+        raise StorageError("slow down")
+
+    monkeypatch.setattr("services.commit.gc.collect_garbage", broken)
+    job_id = world.submit("job", {"a": "frames=3"})
+    world.agent.start()
+    assert world.ended(job_id) is JobState.SUCCEEDED
+    world.wait(lambda: world.store.next_unswept(quiet_s=0) is None, "nobody to try again")
+    assert world.store.get_job(job_id).state is JobState.SUCCEEDED
 
 
 def test_cancelling_stops_the_work_and_frees_the_slot(world: World) -> None:

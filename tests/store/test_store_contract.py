@@ -409,6 +409,34 @@ class TestCommit:
         assert store.next_finalizable() is None
 
 
+class TestTidying:
+    def test_a_finished_job_is_swept_once(self, store: SqlStore) -> None:
+        job_id = planned_job(store, 1)
+        (lease,) = store.claim("a", limit=1, ttl_s=60)
+        store.record_commit(record(lease))
+        store.next_finalizable()
+        assert store.next_unswept(quiet_s=0) is None
+        store.finish_job(job_id)
+        assert store.next_unswept(quiet_s=600) == store.get_job(job_id)
+        store.finish_sweep(job_id)
+        assert store.next_unswept(quiet_s=600) is None
+
+    def test_a_job_that_was_given_up_is_swept_when_nobody_works_on_it(self, store: SqlStore) -> None:
+        job_id = planned_job(store, 1)
+        (lease,) = store.claim("a", limit=1, ttl_s=60)
+        store.fail_job(job_id, "storage_refused", "gone")
+        assert store.next_unswept(quiet_s=0) is None
+        store.release(lease.shard_id, lease.fence, "stopped")
+        assert store.next_unswept(quiet_s=600) is None
+        job = store.next_unswept(quiet_s=-1)
+        assert job is not None
+        assert job.id == job_id
+
+    def test_a_job_without_shards_has_nothing_to_sweep(self, store: SqlStore) -> None:
+        store.request_cancel(store.create_job(spec())[0].id)
+        assert store.next_unswept(quiet_s=-1) is None
+
+
 class TestCancel:
     def test_without_leases_at_once(self, store: SqlStore) -> None:
         queued, _ = store.create_job(spec("/a"))

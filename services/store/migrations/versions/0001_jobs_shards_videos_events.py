@@ -35,6 +35,7 @@ def upgrade() -> None:
         sa.Column("updated_at", _TIME, nullable=False),
         sa.Column("started_at", _TIME, nullable=True),
         sa.Column("finished_at", _TIME, nullable=True),
+        sa.Column("swept", sa.Boolean(), server_default=sa.text("false"), nullable=False),
         sa.Column("shards_total", sa.BigInteger(), server_default=sa.text("0"), nullable=False),
         sa.Column("shards_committed", sa.BigInteger(), server_default=sa.text("0"), nullable=False),
         sa.Column("videos_total", sa.BigInteger(), server_default=sa.text("0"), nullable=False),
@@ -50,6 +51,13 @@ def upgrade() -> None:
         sa.PrimaryKeyConstraint("id", name=op.f("pk_jobs")),
     )
     op.create_index("ix_jobs_state_id", "jobs", ["state", "id"])
+    op.create_index(
+        "ix_jobs_unswept",
+        "jobs",
+        ["id"],
+        sqlite_where=sa.text("swept = 0"),
+        postgresql_where=sa.text("NOT swept"),
+    )
     op.create_index(
         "uq_jobs_output_owner",
         "jobs",
