@@ -41,11 +41,14 @@ def up(
     database_url: Database = None,
 ) -> None:
     """Run the whole service in this process: API, SQLite, a local Ray. Ctrl-C stops it; started again, it goes on."""
+    from services.api.server import check_exposure
+
     settings = _settings(
         host=host, port=port, data_dir=data_dir, num_slots=slots, device=device, database_url=database_url
     )
     if "lease_ttl_s" not in settings.model_fields_set:
         settings = settings.model_copy(update={"lease_ttl_s": _EMBEDDED_LEASE_TTL_S})
+    check_exposure(settings)  # before Ray and the workers start
     with _open_store(settings) as store:
         metrics = _metrics()
         with _running_agent(store, settings, metrics) as running:
