@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+import zlib
 from pathlib import Path
 
 import cv2
@@ -118,3 +119,15 @@ def test_links_out_of_the_directory_are_skipped(tmp_path: Path) -> None:
     (folder / "2.png").symlink_to(elsewhere / "secret.png")
     (folder / "3.png").symlink_to("1.png")
     assert [number_of(frame.rgb) for frame in open_source(folder).frames()] == [1, 1]
+
+
+def test_an_image_is_refused_by_its_header(tmp_path: Path) -> None:
+    """Nothing of it is decoded: a few kilobytes can hold gigabytes of one colour."""
+
+    def chunk(kind: bytes, data: bytes) -> bytes:
+        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+
+    header = chunk(b"IHDR", struct.pack(">IIBBBBB", 30_000, 30_000, 1, 0, 0, 0, 0))
+    (tmp_path / "bomb.png").write_bytes(b"\x89PNG\r\n\x1a\n" + header + chunk(b"IDAT", b"") + chunk(b"IEND", b""))
+    with pytest.raises(MediaTooLarge, match=r"bomb\.png"):
+        open_source(tmp_path)

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from vipe_core.errors import CorruptMedia, MediaNotFound
+from vipe_core.errors import CorruptMedia, MediaNotFound, MediaTooLarge
 from vipe_core.video.limits import Limits
 
 
@@ -28,7 +28,11 @@ def read_image(path: str, limits: Limits) -> NDArray[np.uint8]:
         raise MediaNotFound(f"{label}: {error.strerror or 'cannot be read'}; check the path") from error
     try:
         bgr = cv2.imdecode(data, cv2.IMREAD_COLOR) if len(data) else None
-    except cv2.error:
+    except cv2.error as error:
+        if "CV_IO_MAX_IMAGE" in str(error):
+            raise MediaTooLarge(
+                f"{label}: the image exceeds the limit of {limits.max_pixels} pixels; scale it down"
+            ) from error
         bgr = None
     if bgr is None:
         raise CorruptMedia(f"{label}: the image cannot be decoded; replace or remove it")

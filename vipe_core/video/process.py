@@ -19,6 +19,7 @@ from typing import IO, Any
 import numpy as np
 
 from vipe_core.errors import DecodeCrashed, DecodeError, DecodeTimeout
+from vipe_core.video.limits import Limits
 from vipe_core.video.source import Frame
 from vipe_core.video.wire import (
     DOCUMENT,
@@ -65,7 +66,7 @@ class DecoderProcess:
                     stderr=self._errors,
                     pass_fds=(write_fd,),
                     start_new_session=True,
-                    env=_child_environment(),
+                    env=_child_environment(request.limits),
                 )
             except OSError as error:
                 raise DecodeError(
@@ -193,10 +194,12 @@ class DecoderProcess:
         return DecodeCrashed(f"{self._label}: the decoder process {how}{reason}; try again or re-encode the video")
 
 
-def _child_environment() -> dict[str, str]:
+def _child_environment(limits: Limits) -> dict[str, str]:
     environment = dict(os.environ)
     inherited = environment.get("PYTHONPATH")
     environment["PYTHONPATH"] = f"{_PACKAGE_ROOT}{os.pathsep}{inherited}" if inherited else str(_PACKAGE_ROOT)
     # The child does no linear algebra: thread pools would only slow its start.
     environment.update(OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1")
+    # OpenCV judges an image by its header with this, before it makes room for what a few bytes can claim to hold.
+    environment["OPENCV_IO_MAX_IMAGE_PIXELS"] = str(limits.max_pixels)
     return environment
