@@ -341,3 +341,13 @@ def test_a_failed_write_closes_the_dense_stream_while_the_error_is_still_held(tm
         write_artifacts(replace(annotation, dense=dense), tmp_path, progress=full_disk)
     assert caught.value.__traceback__ is not None
     assert streams[0].gi_frame is None
+
+
+@pytest.mark.parametrize("stamp", ["soon", None, [0.0]])
+def test_times_that_are_no_numbers_are_refused(tmp_path: Path, stamp: object) -> None:
+    info = write_artifacts(make_annotation(), tmp_path, attributes=("pose", "intrinsics")).info
+    document = json.loads(info.read_text())
+    document["timestamps_s"][2] = stamp
+    info.write_text(json.dumps(document))
+    with pytest.raises(FormatError, match="timestamps_s"):
+        read_artifacts(tmp_path, "clip")

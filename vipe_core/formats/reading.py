@@ -158,6 +158,8 @@ def _read_info(path: Path, num_frames: int) -> dict[str, Any]:
     stamps = info.get("timestamps_s") if isinstance(info, dict) else None
     if not isinstance(stamps, list) or len(stamps) != num_frames or info.get("num_frames") != num_frames:
         raise FormatError(f"{path.parent.name}/{path.name}: does not describe the {num_frames} frames of the poses")
+    if not all(isinstance(stamp, (int, float)) for stamp in stamps):
+        raise FormatError(f"{path.parent.name}/{path.name}: `timestamps_s` must be numbers")
     return info
 
 
