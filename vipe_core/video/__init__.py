@@ -3,7 +3,6 @@
 Kept free of heavy imports (torch, OpenCV, PyAV): the decoder child imports this package at every start.
 """
 
-from vipe_core.video.cache import FrameCache
 from vipe_core.video.image_directory import ImageDirectorySource
 from vipe_core.video.limits import Limits
 from vipe_core.video.naming import sanitise_name
@@ -14,7 +13,6 @@ from vipe_core.video.video_file import VideoFileSource
 
 __all__ = [
     "Frame",
-    "FrameCache",
     "FrameSource",
     "FrameStream",
     "ImageDirectorySource",
