@@ -25,7 +25,10 @@ def annotate(
     device: Annotated[str, typer.Option(help="cpu or cuda.")] = "cpu",
     as_json: Annotated[bool, typer.Option("--json", help="One JSON line per input on stdout, nothing else.")] = False,
 ) -> None:
-    """Annotate videos here: poses, intrinsics and dense depth in ViPE's artifact layout."""
+    """Annotate videos on this machine, without the service.
+
+    Writes poses, intrinsics, dense depth and the frames in ViPE's artifact layout. Exit code 1 if any input failed.
+    """
     from rich.console import Console
 
     from vipe_core.errors import VipeError

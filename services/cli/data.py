@@ -23,7 +23,10 @@ def verify(
     deep: Annotated[bool, typer.Option("--deep", help="Also read every tar: sha256, members, keys.")] = False,
     endpoint: Endpoint = None,
 ) -> None:
-    """Prove that an output is complete: every video committed or failed, every object there. Exit code 1 if not."""
+    """Prove that an output is complete.
+
+    Every video is committed or failed, once; every object is there with its size. Exit code 1 if not.
+    """
     from services.dataset import verify as check
     from services.storage import open_store
 
@@ -51,7 +54,7 @@ def unpack(
     key: Annotated[list[str] | None, typer.Option("--key", help="Only these videos.")] = None,
     endpoint: Endpoint = None,
 ) -> None:
-    """Unpack tars into the directory layout that nvidia-vipe's own tools read."""
+    """Unpack tars into the folders that nvidia-vipe reads."""
     from services.dataset import unpack as unpack_dataset
     from services.storage import open_store
 
@@ -67,7 +70,7 @@ def export(
     depth_stride: Annotated[int, typer.Option(min=1, help="Keep every n-th depth pixel per axis.")] = 4,
     endpoint: Endpoint = None,
 ) -> None:
-    """Export poses, intrinsics and depth to one file per video."""
+    """Export each video to one file of arrays."""
     import tempfile
 
     from services.dataset import DatasetIndex

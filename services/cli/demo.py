@@ -34,7 +34,11 @@ def demo(
         Path, typer.Option("-o", "--output", help="Folder of this run; replaced if a demo made it.")
     ] = Path("vipe_output/demo"),
 ) -> None:
-    """Start the service, annotate sample videos (or yours) through it, check the output, and stop everything."""
+    """Show the whole system on sample videos, or on yours.
+
+    Starts the service, submits a job over REST, waits, verifies the output, scores it where the truth is known, and
+    stops everything that it started.
+    """
     from services.cli.tables import results_console
 
     console = results_console()

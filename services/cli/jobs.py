@@ -93,7 +93,10 @@ def status(job_id: str, api: ApiUrl = DEFAULT_API, api_key: ApiKey = None) -> No
 
 
 def watch(job_id: str, api: ApiUrl = DEFAULT_API, api_key: ApiKey = None) -> None:
-    """Show progress until the job ends; exit code 1 unless it succeeded without errors."""
+    """Show a job's progress until it ends.
+
+    Exit code 1 unless it succeeded without errors.
+    """
     _watch(_client(api, api_key), job_id)
 
 

@@ -61,22 +61,23 @@ def _typed_errors(command: Callable[P, R]) -> Callable[P, R]:
     return run
 
 
-_ENGINE, _SERVICE, _DATA = "Annotate here", "Run and use the service", "Use the output"
-
-app.command("annotate", rich_help_panel=_ENGINE)(_typed_errors(annotate.annotate))
-app.command("demo", rich_help_panel=_ENGINE)(_typed_errors(demo.demo))
-app.command("up", rich_help_panel=_SERVICE)(_typed_errors(serve.up))
-app.command("api", rich_help_panel=_SERVICE)(_typed_errors(serve.api))
-app.command("agent", rich_help_panel=_SERVICE)(_typed_errors(serve.agent))
-app.command("submit", rich_help_panel=_SERVICE)(_typed_errors(jobs.submit))
-app.command("jobs", rich_help_panel=_SERVICE)(_typed_errors(jobs.list_jobs))
-app.command("status", rich_help_panel=_SERVICE)(_typed_errors(jobs.status))
-app.command("watch", rich_help_panel=_SERVICE)(_typed_errors(jobs.watch))
-app.command("videos", rich_help_panel=_SERVICE)(_typed_errors(jobs.videos))
-app.command("cancel", rich_help_panel=_SERVICE)(_typed_errors(jobs.cancel))
-app.command("verify", rich_help_panel=_DATA)(_typed_errors(data.verify))
-app.command("unpack", rich_help_panel=_DATA)(_typed_errors(data.unpack))
-app.command("export", rich_help_panel=_DATA)(_typed_errors(data.export))
+for _name, _command in {
+    "annotate": annotate.annotate,
+    "demo": demo.demo,
+    "up": serve.up,
+    "api": serve.api,
+    "agent": serve.agent,
+    "submit": jobs.submit,
+    "jobs": jobs.list_jobs,
+    "status": jobs.status,
+    "watch": jobs.watch,
+    "videos": jobs.videos,
+    "cancel": jobs.cancel,
+    "verify": data.verify,
+    "unpack": data.unpack,
+    "export": data.export,
+}.items():
+    app.command(_name)(_typed_errors(_command))
 
 if __name__ == "__main__":
     sys.exit(app())

@@ -40,7 +40,10 @@ def up(
     device: Device = None,
     database_url: Database = None,
 ) -> None:
-    """Run the whole service in this process: API, SQLite, a local Ray. Ctrl-C stops it; started again, it goes on."""
+    """Run the whole service here: API, SQLite, a local Ray.
+
+    Ctrl-C stops it; started again, it goes on where it was.
+    """
     from services.api.server import check_exposure
 
     settings = _settings(
@@ -56,7 +59,7 @@ def up(
 
 
 def api(host: Host = None, port: Port = None, database_url: Database = None) -> None:
-    """Run the API alone; agents elsewhere share its database."""
+    """Run the API alone; agents share its database."""
     settings = _settings(host=host, port=port, database_url=database_url)
     with _open_store(settings) as store:
         _serve_api(store, settings, _metrics())
@@ -69,7 +72,10 @@ def agent(
     metrics_host: Annotated[str, typer.Option(help="Address of /metrics.")] = "127.0.0.1",
     metrics_port: Annotated[int, typer.Option(help="Port of /metrics; 0 takes a free one.")] = 9090,
 ) -> None:
-    """Run an agent alone: it leases shards and runs them on Ray (VIPE_RAY_ADDRESS, or a private one)."""
+    """Run an agent alone, without the API.
+
+    It leases shards from the database and runs them on Ray: the cluster of VIPE_RAY_ADDRESS, or a private one.
+    """
     settings = _settings(num_slots=slots, device=device, database_url=database_url)
     metrics = _metrics()
     stop = threading.Event()
