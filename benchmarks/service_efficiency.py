@@ -30,7 +30,7 @@ def main() -> None:
     parser.add_argument("videos", nargs="*", type=Path, help="default: the sample videos")
     parser.add_argument("--slots", type=int, default=1)
     arguments = parser.parse_args()
-    videos = [path.resolve() for path in arguments.videos] or [sample_path(name).video for name in DEMO_NAMES]
+    videos = [path.resolve() for path in arguments.videos] or [sample_path(name).video.resolve() for name in DEMO_NAMES]
     with tempfile.TemporaryDirectory(prefix="vipe-efficiency-") as folder:
         loop = bare_loop(videos, Path(folder) / "loop")
         service = through_service(videos, Path(folder), arguments.slots)
