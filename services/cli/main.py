@@ -61,7 +61,7 @@ def _typed_errors(command: Callable[P, R]) -> Callable[P, R]:
     return run
 
 
-for _name, _command in {
+_COMMANDS: dict[str, Callable[..., None]] = {
     "annotate": annotate.annotate,
     "demo": demo.demo,
     "up": serve.up,
@@ -76,7 +76,8 @@ for _name, _command in {
     "verify": data.verify,
     "unpack": data.unpack,
     "export": data.export,
-}.items():
+}
+for _name, _command in _COMMANDS.items():
     app.command(_name)(_typed_errors(_command))
 
 if __name__ == "__main__":
