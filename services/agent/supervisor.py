@@ -16,6 +16,7 @@ import logging
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Literal, TypeVar
 
 from services.agent.backoff import Backoff, GiveBacks, exponential_s
@@ -202,7 +203,7 @@ class Supervisor:
                 continue
             live.follow(tuple(results.values()), self._handle.progress)
             with context(video=video.key):
-                answer = self._run(live, AnnotateVideo(lease, video), lambda v=video: self._budget_s(v))  # type: ignore[misc]
+                answer = self._run(live, AnnotateVideo(lease, video), partial(self._budget_s, video))
                 match answer:
                     case Annotated(result):
                         results[video.key] = result
