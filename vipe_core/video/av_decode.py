@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
-from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -30,8 +29,6 @@ _FORMATS = (
     "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm,avi,mpegts,mpeg,mpegvideo,flv,ogg,asf,gif,ivf,h264,hevc,nut,"
     "wav,mp3,aac,flac,aiff"
 )
-_INDEXED_FORMATS = frozenset({"mov,mp4,m4a,3gp,3g2,mj2", "matroska,webm"})
-_EXACT_ENTRY_CODECS = frozenset({"h264", "hevc", "vp8", "vp9", "libvpx-vp9", "av1", "libdav1d", "ffv1", "mjpeg"})
 _OPTIONS = {"protocol_whitelist": "file", "format_whitelist": _FORMATS}
 
 _PLAYLIST_HEADS = (
@@ -85,29 +82,6 @@ class Damage:
         if self.bad_pictures:
             parts.append(f"{self.bad_pictures} damaged pictures were dropped")
         return "; ".join(parts) or None
-
-
-@dataclass(slots=True)
-class EntryLog:
-    """Pictures at which decoding can begin, found on a complete pass, so that a later one need not start at 0.
-
-    Kept only where that is exact: every timestamp came from the container and increased, nothing was damaged, the
-    container seeks by an index and the codec promises that what follows a key picture in presentation order depends on
-    nothing before it.
-    """
-
-    entries: list[tuple[int, int]] = field(default_factory=list)
-    exact: bool = True
-
-    def note(self, index: int, frame: VideoFrame, timestamp_s: float) -> None:
-        self.exact = self.exact and timestamp_s == _timestamp_s(frame)
-        if frame.key_frame and frame.pts is not None and index > 0:
-            self.entries.append((index, frame.pts))
-
-    def thinned(self, limit: int) -> list[tuple[int, int]]:
-        """(index, pts) of at most `limit` entries, evenly thinned; none if they would not be exact."""
-        step = max(1, math.ceil(len(self.entries) / limit))
-        return self.entries[::step] if self.exact else []
 
 
 def open_video(path: str) -> tuple[InputContainer, VideoStream]:
@@ -168,19 +142,11 @@ def decode(
     threads: int,
     damage: Damage,
     on_progress: Callable[[], None],
-    *,
-    entry: tuple[int, int] | None = None,
-    log: EntryLog | None = None,
 ) -> Iterator[tuple[int, float, VideoFrame]]:
     """Every picture in presentation order as (index, timestamp_s, frame), indices 0, 1, 2 ...
 
     Pictures that the decoder itself marks as damaged are dropped and counted in `damage`; a clip that is cut short ends
     early. `on_progress` is called for each packet.
-
-    Args:
-        entry: (index, pts) from the `EntryLog` of an earlier pass: begin there instead of at 0. Where the container
-            does not lead to exactly that picture, decoding begins at 0 after all.
-        log: Filled with the entries that this pass finds; to be used after a complete pass from 0 only.
 
     Raises:
         InputError: Typed, naming the file; CorruptMedia or EmptyMedia when there is no picture at all.
@@ -189,29 +155,13 @@ def decode(
     container, stream = open_video(path)
     with container:
         limits.check_picture(label, stream.codec_context.width, stream.codec_context.height)
-        if log is not None:
-            seekable = container.format.name in _INDEXED_FORMATS and stream.codec_context.name in _EXACT_ENTRY_CODECS
-            log.exact = log.exact and seekable
         clock = Clock(1.0 / _fps(stream))
-        pictures: Iterator[VideoFrame] | None
-        if entry is None:
-            first = 0
-            pictures = _pictures(container, stream, label, limits, threads, damage, on_progress)
-        else:
-            first = entry[0]
-            pictures = _pictures_from(container, stream, label, limits, threads, entry[1], on_progress)
-        if pictures is not None:
-            index = -1
-            for index, frame in enumerate(pictures, start=first):
-                limits.check_length(label, index + 1, None)
-                timestamp_s = clock.repaired(_timestamp_s(frame))
-                if log is not None:
-                    log.note(index, frame, timestamp_s)
-                yield index, timestamp_s, frame
-            if index < 0:
-                raise _no_picture(label, stream)
-            return
-    yield from decode(path, limits, threads, damage, on_progress)
+        index = -1
+        for index, frame in enumerate(_pictures(container, stream, label, limits, threads, damage, on_progress)):
+            limits.check_length(label, index + 1, None)
+            yield index, clock.repaired(_timestamp_s(frame)), frame
+        if index < 0:
+            raise _no_picture(label, stream)
 
 
 @dataclass(slots=True)
@@ -380,30 +330,6 @@ def _timestamp_s(frame: VideoFrame) -> float | None:
     if frame.pts is None or frame.time_base is None:
         return None
     return float(frame.pts * frame.time_base)
-
-
-def _pictures_from(
-    container: InputContainer,
-    stream: VideoStream,
-    label: str,
-    limits: Limits,
-    threads: int,
-    pts: int,
-    on_progress: Callable[[], None],
-) -> Iterator[VideoFrame] | None:
-    """Pictures from the one at `pts` on, or None if seeking does not lead there."""
-    try:
-        container.seek(pts, stream=stream, backward=True)
-    except av.error.FFmpegError:
-        return None
-    # Pictures that precede the entry may lack their references; those are no damage of the clip.
-    pictures = _pictures(container, stream, label, limits, threads, Damage(), on_progress)
-    for frame in pictures:
-        if frame.pts == pts:
-            return chain((frame,), pictures)
-        if frame.pts is None or frame.pts > pts:
-            return None
-    return None
 
 
 def _is_cover(stream: VideoStream) -> bool:

@@ -25,7 +25,6 @@ from vipe_core.video.wire import DOCUMENT, HEARTBEAT, PICTURE, Header, Request, 
 
 _HEARTBEAT_S = 0.5
 # Enough for a group of pictures each in an hour of video, and far below the size limit of a document.
-_MAX_ENTRIES = 4096
 _MAX_WRITTEN_FILE_BYTES = 1 << 20
 
 
@@ -89,22 +88,18 @@ def _decode_images(request: Request, link: _Link) -> None:
 def _decode_video(request: Request, link: _Link) -> None:
     from pathlib import Path
 
-    from vipe_core.video.av_decode import Damage, EntryLog, PictureConverter, decode
+    from vipe_core.video.av_decode import Damage, PictureConverter, decode
 
-    damage, log = Damage(), EntryLog()
+    damage = Damage()
     path = request.paths[0]
     converter = PictureConverter(Path(path).name, request.size, request.limits)
-    pictures = decode(path, request.limits, request.threads, damage, link.progress, entry=request.entry, log=log)
-    for index, timestamp_s, frame in pictures:
+    for index, timestamp_s, frame in decode(path, request.limits, request.threads, damage, link.progress):
         if index >= request.start:
             link.picture(index, timestamp_s, converter.convert(frame))
         if request.stop is not None and index + 1 >= request.stop:
             link.document(b'{"end": true}')
             return
-    sentence = damage.sentence()
-    complete = request.entry is None and sentence is None
-    entries = log.thinned(_MAX_ENTRIES) if complete else []
-    link.document(json.dumps({"end": True, "damage": sentence, "entries": entries}).encode())
+    link.document(json.dumps({"end": True, "damage": damage.sentence()}).encode())
 
 
 def _exit_with_parent() -> None:

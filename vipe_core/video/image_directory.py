@@ -112,7 +112,6 @@ class ImageDirectorySource:
             size=size,
             start=start,
             stop=stop,
-            entry=None,
             fps=fps,
             threads=1,
             stall_s=self._stall_s,

@@ -81,7 +81,6 @@ def probe(
         size=None,
         start=0,
         stop=None,
-        entry=None,
         fps=0.0,
         threads=1,
         stall_s=budget_s,

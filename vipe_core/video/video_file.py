@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import bisect
 import logging
 import os
 from pathlib import Path
@@ -29,9 +28,7 @@ class VideoFileSource:
 
     Every iterator owns one child process; it ends when the iterator is exhausted, closed or garbage collected. A range
     that does not start at 0 decodes and discards what lies before, because only that numbers frames exactly in every
-    container; once a pass over the whole clip has found key pictures from which decoding is exact, it begins at the
-    last one before the range. A file that is damaged or cut short gives the pictures that are whole, and says so in
-    `damage`.
+    container. A file that is damaged or cut short gives the pictures that are whole, and says so in `damage`.
 
     Args:
         path: Video file.
@@ -59,7 +56,6 @@ class VideoFileSource:
         self._path = Path(path).absolute()
         self._info = probe(path, limits=self._limits, name=name, budget_s=max(stall_s, PROBE_BUDGET_S))
         self._damage: str | None = None
-        self._entries: list[tuple[int, int]] = []
 
     @property
     def info(self) -> VideoInfo:
@@ -85,7 +81,6 @@ class VideoFileSource:
             size=size,
             start=start,
             stop=stop,
-            entry=self._entry_before(start),
             fps=self._info.fps,
             threads=self._threads,
             stall_s=self._stall_s,
@@ -97,18 +92,11 @@ class VideoFileSource:
                 else:
                     self._note_end(item)
 
-    def _entry_before(self, index: int) -> tuple[int, int] | None:
-        position = bisect.bisect_right(self._entries, index, key=lambda entry: entry[0])
-        return self._entries[position - 1] if position else None
-
     def _note_end(self, document: dict[str, Any]) -> None:
         damage = document.get("damage")
         if damage and self._damage is None:
             self._damage = str(damage)
             _LOG.warning("%s: %s; the whole pictures are used", self._path.name, self._damage)
-        entries = document.get("entries")
-        if entries:
-            self._entries = [(int(index), int(pts)) for index, pts in entries]
 
 
 def check_range(size: tuple[int, int] | None, start: int, stop: int | None) -> None:

@@ -66,7 +66,6 @@ class Request:
         files: Name of one video file, or the names of the images in order.
         images: Whether `files` are images.
         size: (width, height) of the upright picture to send, or None for its own size.
-        entry: (index, pts) of a picture before `start` at which decoding may begin, or None.
         fps: Frame rate that images are given.
         threads: Decoder threads.
         stall_s: Seconds without progress after which the child ends itself (the parent's limit is shorter).
@@ -80,7 +79,6 @@ class Request:
     size: tuple[int, int] | None
     start: int
     stop: int | None
-    entry: tuple[int, int] | None
     fps: float
     threads: int
     stall_s: float
@@ -99,7 +97,6 @@ class Request:
         fields["limits"] = Limits(**fields["limits"])
         fields["files"] = tuple(fields["files"])
         fields["size"] = tuple(fields["size"]) if fields["size"] else None
-        fields["entry"] = tuple(fields["entry"]) if fields["entry"] else None
         return cls(**fields)
 
 
