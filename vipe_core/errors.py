@@ -12,7 +12,6 @@
     │   ├── DecodeTimeout         decode_timeout      (retryable)
     │   └── DecodeCrashed         decode_crashed      (retryable)
     ├── ConfigError           invalid_config          a preset, camera or device that does not exist
-    ├── WeightsMissing        weights_missing         a preset needs network weights that are not here
     ├── FormatError           format_error            an artifact on disk does not hold what it must
     └── EngineError           engine_failed           a stage could not finish; always a defect of ours
 
@@ -101,10 +100,6 @@ class DecodeCrashed(DecodeError):
 
 class ConfigError(VipeError):
     code = "invalid_config"
-
-
-class WeightsMissing(VipeError):
-    code = "weights_missing"
 
 
 class FormatError(VipeError):

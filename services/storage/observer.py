@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Literal, Protocol
-
-Operation = Literal["put", "create", "get", "head", "list", "delete"]
+from typing import Protocol
 
 
 class StorageObserver(Protocol):
@@ -14,7 +12,7 @@ class StorageObserver(Protocol):
         """One request was answered.
 
         Args:
-            op: An `Operation`.
+            op: put, create, get, head, list or delete.
             status: The HTTP status (a directory answers with the status that S3 would give: 200, 404, 412), or `error`
                 where no answer came.
         """

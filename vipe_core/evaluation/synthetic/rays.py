@@ -75,7 +75,3 @@ class RayGrid:
         half_angle = np.zeros(num_tiles)
         np.maximum.at(half_angle, tile, apart)
         return cls(camera, directions, angle.ravel(), tile, axis, half_angle)
-
-    def ray_from_z(self) -> NDArray[np.float64]:
-        """(H, W) z component of the unit rays: z = distance * this."""
-        return self.directions[:, 2].reshape(self.camera.height, self.camera.width)
