@@ -249,3 +249,37 @@ def test_agrees_with_the_independent_scorer(shared_data: Path, kind: str) -> Non
     assert depth_part.delta125 == pytest.approx(theirs["depth_static"]["delta125"], rel=1e-3)
     assert depth_part.scale == pytest.approx(theirs["depth_raw_scale"], rel=1e-5)
     assert depth_pose_scale_ratio(depth_part, ours) == pytest.approx(theirs["depth_pose_scale"], rel=1e-5)
+
+
+def test_scale_and_shift_undo_scale_and_shift() -> None:
+    rng = np.random.default_rng(3)
+    truth = rng.uniform(2, 30, (4, 20, 30)).astype(np.float32)
+    estimate = (truth - 1.5) / 4
+    use = np.ones(truth.shape[1:], np.bool_)
+    # A tenth of the values is far too near: least absolute errors do not follow them.
+    estimate[:, :2] *= 0.3
+    pairs = [(e, t, use) for e, t in zip(estimate, truth, strict=True)]
+    errors = depth_errors(pairs, "scale_shift")
+    assert errors is not None
+    assert errors.scale == pytest.approx(4, rel=1e-3)
+    assert errors.shift == pytest.approx(1.5, rel=1e-2)
+    assert errors.delta125 == pytest.approx(0.9, abs=0.02)
+    metric = depth_errors(pairs, "metric")
+    assert metric is not None
+    assert (metric.scale, metric.shift) == (1.0, 0.0)
+    assert metric.abs_rel > 0.5
+
+
+def test_depth_beyond_the_limit_is_not_judged() -> None:
+    truth = np.array([[1.0, 2.0, 500.0]], np.float32)
+    estimate = np.array([[1.0, 2.0, 3.0]], np.float32)
+    use = np.ones((1, 3), np.bool_)
+    limited = depth_errors([(estimate, truth, use)], max_depth=70.0)
+    assert limited is not None
+    assert (limited.abs_rel, limited.density) == (0.0, 1.0)
+    # An estimate beyond the limit counts as one at the limit.
+    far = depth_errors(
+        [(np.array([[1.0, 2.0, 1e4]], np.float32), np.array([[1.0, 2.0, 50.0]], np.float32), use)], "metric", 70
+    )
+    assert far is not None
+    assert far.abs_rel == pytest.approx((70 - 50) / 50 / 3)

@@ -1,7 +1,9 @@
 """Accuracy against ground truth: trajectory, field of view and depth, as in the paper's tables.
 
 An estimate is defined up to a similarity transform of the world, so trajectories are compared after the least-squares
-Sim(3) alignment of the camera centres, and depth after one median scale for the whole sequence.
+Sim(3) alignment of the camera centres, and depth after one alignment for the whole sequence: the median scale unless
+told otherwise. The paper's depth table follows the protocol of CUT3R, which has all of `DepthAlignment`, without saying
+which; so a report names the one it used.
 """
 
 from __future__ import annotations
@@ -9,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +20,11 @@ from vipe_core.annotation import DepthKind
 from vipe_core.cameras import Camera
 from vipe_core.geometry import Sim3, umeyama
 
+DepthAlignment = Literal["metric", "scale", "scale_shift"]
+"""`metric`: none. `scale`: the median of truth / estimate. `scale_shift`: scale and offset with the least absolute
+error. One for all frames of a sequence, never per frame."""
+
+_MAX_FITTED = 1_000_000  # values that scale and shift are fitted to; more say nothing new
 _MOVES = 1e-6  # metres: below this path length or spread a trajectory counts as standing still
 
 
@@ -47,14 +55,15 @@ class TrajectoryErrors:
 
 @dataclass(frozen=True, slots=True)
 class DepthErrors:
-    """Errors of depth after one median scale.
+    """Errors of depth after one alignment of the whole sequence.
 
     Attributes:
-        abs_rel: Mean of |estimate - truth| / truth.
+        abs_rel: Mean of |estimate - truth| / truth (RelAbs in the paper).
         log_rmse: RMS of log(estimate / truth).
         delta125: Share of values within a factor of 1.25 of the truth.
-        scale: The median of truth / estimate that was applied; 1 for depth that is metric and right.
+        scale: The factor that was applied; 1 for depth that is metric and right.
         density: Share of the true values that have an estimate.
+        shift: What was added after scaling, units of the truth.
     """
 
     abs_rel: float
@@ -62,6 +71,7 @@ class DepthErrors:
     delta125: float
     scale: float
     density: float
+    shift: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -150,12 +160,17 @@ def camera_errors(estimate: Camera, truth: Camera) -> CameraErrors | None:
 
 def depth_errors(
     pairs: Iterable[tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_]]],
+    alignment: DepthAlignment = "scale",
+    max_depth: float | None = None,
 ) -> DepthErrors | None:
-    """Compares depth frame by frame with one scale for the sequence, the median of truth / estimate.
+    """Compares depth frame by frame with one alignment for the sequence; all pixels weigh the same.
 
     Args:
         pairs: (estimate, truth, use) per frame, each (h, w) and of the same kind of depth. Values <= 0 or not finite
             are missing; `use` selects pixels, e.g. the static ones.
+        alignment: See `DepthAlignment`.
+        max_depth: True values beyond are left out and aligned estimates cut to it (the sky of a rendered film has a
+            depth, but no meaning). Units of the truth.
 
     Returns:
         None without a single pixel that has both values.
@@ -163,11 +178,12 @@ def depth_errors(
     Raises:
         ValueError: Shapes of a frame disagree.
     """
+    farthest = math.inf if max_depth is None else max_depth
     estimates, truths, wanted = [], [], 0
     for estimate, truth, use in pairs:
         if not estimate.shape == truth.shape == use.shape:
             raise ValueError(f"frames of different shapes: {estimate.shape}, {truth.shape} and {use.shape}")
-        valid = use & np.isfinite(truth) & (truth > _MOVES)
+        valid = use & np.isfinite(truth) & (truth > _MOVES) & (truth < farthest)
         wanted += int(valid.sum())
         valid &= np.isfinite(estimate) & (estimate > 1e-9)
         estimates.append(estimate[valid])
@@ -176,8 +192,11 @@ def depth_errors(
         return None
     estimated = np.concatenate(estimates).astype(np.float64)
     true = np.concatenate(truths).astype(np.float64)
-    scale = float(np.median(true / estimated))
+    scale, shift = _align_depth(estimated, true, alignment)
     estimated *= scale
+    if alignment == "scale_shift" or max_depth is not None:
+        # A shift may push near things behind the camera: they stay in the figures, as near as can be.
+        estimated = np.clip(estimated + shift, 1e-3 * float(np.median(true)), farthest)
     log_ratio = np.log(estimated / true)
     return DepthErrors(
         abs_rel=float(np.mean(np.abs(estimated - true) / true)),
@@ -185,6 +204,7 @@ def depth_errors(
         delta125=float(np.mean(np.abs(log_ratio) < math.log(1.25))),
         scale=scale,
         density=len(true) / wanted,
+        shift=shift,
     )
 
 
@@ -271,6 +291,34 @@ def _align(points: NDArray[np.float64], target: NDArray[np.float64], world: NDAr
     turned = centred @ world.T
     scale = float((centred_target * turned).sum() / (centred**2).sum())
     return Sim3(scale, world, target.mean(0) - scale * world @ points.mean(0))
+
+
+def _align_depth(
+    estimated: NDArray[np.float64], true: NDArray[np.float64], alignment: DepthAlignment
+) -> tuple[float, float]:
+    """Scale and shift that take `estimated` to `true`."""
+    if alignment == "metric":
+        return 1.0, 0.0
+    scale, shift = float(np.median(true / estimated)), 0.0
+    if alignment == "scale":
+        return scale, shift
+    step = -(-len(true) // _MAX_FITTED)
+    x, y = estimated[::step], true[::step]
+    floor = 1e-4 * float(np.median(y))
+    # Least absolute deviations by iteratively reweighted least squares: each step solves a weighted 2x2 system.
+    for _ in range(50):
+        weight = 1 / np.maximum(np.abs(scale * x + shift - y), floor)
+        total = weight.sum()
+        mean_x, mean_y = (weight * x).sum() / total, (weight * y).sum() / total
+        variance = (weight * np.square(x - mean_x)).sum()
+        if not variance > 0:
+            break
+        before = scale, shift
+        scale = float((weight * (x - mean_x) * (y - mean_y)).sum() / variance)
+        shift = float(mean_y - scale * mean_x)
+        if abs(scale - before[0]) < 1e-9 * abs(scale) and abs(shift - before[1]) < floor:
+            break
+    return scale, shift
 
 
 def _nearest_rotation(matrix: NDArray[np.float64]) -> NDArray[np.float64]:

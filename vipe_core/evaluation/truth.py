@@ -1,11 +1,13 @@
-"""Ground truth on disk (gt.npz), and one sequence's estimate compared with it."""
+"""Ground truth in one shape for every dataset, its own file format (gt.npz), and an estimate compared with it."""
 
 from __future__ import annotations
 
+import math
 import zipfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +17,7 @@ from vipe_core.cameras import Camera, CameraModel
 from vipe_core.errors import ConfigError, FormatError
 from vipe_core.evaluation.metrics import (
     CameraErrors,
+    DepthAlignment,
     DepthErrors,
     TrajectoryErrors,
     camera_errors,
@@ -28,25 +31,60 @@ from vipe_core.formats import Artifacts
 
 _MODELS: dict[str, CameraModel] = {"pinhole": "pinhole", "mei": "mei", "equirect": "equirect"}
 _KINDS: dict[str, DepthKind] = {"z": "z", "ray": "ray"}
+# Depth values that one comparison holds in memory; of longer or finer sequences every k-th row and column counts.
+_MAX_DEPTH_VALUES = 20_000_000
+
+
+class DepthFrames(Protocol):
+    """Depth maps by number: an array, or a reader that opens a file for each."""
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """(N, h, w)."""
+
+    def __getitem__(self, row: int, /) -> NDArray[Any]:
+        """(h, w) depth of row `row` of the truth, 0 where unknown."""
 
 
 @dataclass(frozen=True, slots=True)
 class GroundTruth:
-    """The truth of one video; keys of the file as in `vipe_core.evaluation.samples`.
+    """The truth of one video.
 
     Attributes:
         world_from_cam: (N, 4, 4) float64, OpenCV axes, metres.
         frame_index: (N,) int64: which frame of the video each row belongs to.
-        depth: (N, h, w) float16 of kind `depth_kind`, 0 where unknown; None where the file has none.
-        dynamic: (N, h, w) bool; all false where the file does not say.
+        camera: None where the dataset publishes no calibration of the pictures.
+        depth: N maps of kind `depth_kind`, 0 where unknown, on any grid over the picture; None where there are none.
+        dynamic: (N, h, w) bool, true on pixels that move by themselves; None where the dataset does not say.
     """
 
     world_from_cam: NDArray[np.float64]
     frame_index: NDArray[np.int64]
-    camera: Camera
-    depth: NDArray[np.float16] | None
+    camera: Camera | None
+    depth: DepthFrames | None
     depth_kind: DepthKind
     dynamic: NDArray[np.bool_] | None
+
+
+@dataclass(frozen=True, slots=True)
+class Estimate:
+    """What is compared with the truth.
+
+    Attributes:
+        name: For error messages.
+        world_from_cam: (M, 4, 4) float64.
+        frame_index: (M,) which frame of the video each pose belongs to.
+        camera: At any resolution of the same pictures.
+        depth: M depth maps in order, or None to leave depth out.
+        depth_kind: Kind of these.
+    """
+
+    name: str
+    world_from_cam: NDArray[np.float64]
+    frame_index: Sequence[int] | NDArray[np.int64]
+    camera: Camera
+    depth: Iterable[NDArray[np.float32]] | None = None
+    depth_kind: DepthKind = "z"
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,21 +127,53 @@ def read_truth(path: str | Path) -> GroundTruth:
     return GroundTruth(poses, index, camera, depth, kind, values.get("dynamic"))
 
 
-def evaluate_artifacts(artifacts: Artifacts, truth: GroundTruth) -> SequenceReport:
+def evaluate(
+    estimate: Estimate, truth: GroundTruth, alignment: DepthAlignment = "scale", max_depth: float | None = None
+) -> SequenceReport:
+    """Compares an estimate with the truth; takes one depth map at a time.
+
+    Args:
+        alignment, max_depth: As in `depth_errors`.
+
+    Raises:
+        FormatError: They share fewer than two frames.
+    """
+    rows = _matching(estimate.frame_index, truth, estimate.name)
+    camera = estimate.camera
+    if truth.camera is not None and (camera.width, camera.height) != (truth.camera.width, truth.camera.height):
+        camera = camera.resized(truth.camera.width, truth.camera.height)
+    depth = None
+    if estimate.depth is not None and truth.depth is not None:
+        depth = depth_errors(_depth_pairs(estimate, estimate.depth, truth, rows, camera), alignment, max_depth)
+    return _report(estimate.world_from_cam[rows[:, 0]], camera, depth, truth, rows[:, 1])
+
+
+def evaluate_artifacts(
+    artifacts: Artifacts, truth: GroundTruth, alignment: DepthAlignment = "scale", max_depth: float | None = None
+) -> SequenceReport:
     """Compares artifacts on disk with the truth; reads one depth map at a time.
+
+    Args:
+        alignment, max_depth: As in `depth_errors`.
 
     Raises:
         FormatError: The artifacts are damaged, or share fewer than two frames with the truth.
     """
-    rows = _matching(artifacts.frame_index, truth, artifacts.name)
-    estimate = artifacts.world_from_cam[rows[:, 0]]
-    depth = None
-    if artifacts.has_depth and truth.depth is not None:
-        depth = depth_errors(_depth_pairs(artifacts, truth, rows))
-    camera = artifacts.camera
-    if (camera.width, camera.height) != (truth.camera.width, truth.camera.height):
-        camera = camera.resized(truth.camera.width, truth.camera.height)
-    return _report(estimate, camera, depth, truth, rows[:, 1])
+
+    def estimate(depth: Iterable[NDArray[np.float32]] | None) -> Estimate:
+        return Estimate(
+            artifacts.name,
+            artifacts.world_from_cam,
+            artifacts.frame_index,
+            artifacts.camera,
+            depth,
+            artifacts.depth_kind,
+        )
+
+    if not artifacts.has_depth or truth.depth is None:
+        return evaluate(estimate(None), truth)
+    with artifacts.open_depth() as reader:
+        return evaluate(estimate(reader), truth, alignment, max_depth)
 
 
 def evaluate_static_guess(truth: GroundTruth, fov_x_deg: float = 60.0) -> SequenceReport:
@@ -111,12 +181,14 @@ def evaluate_static_guess(truth: GroundTruth, fov_x_deg: float = 60.0) -> Sequen
     rows = np.arange(len(truth.world_from_cam))
     estimate = np.repeat(np.eye(4)[None], len(rows), axis=0)
     camera = truth.camera
-    if camera.model != "equirect":
-        camera = Camera.pinhole_from_fov(fov_x_deg, camera.width, camera.height)
+    if camera is None or camera.model != "equirect":
+        width, height = (1, 1) if camera is None else (camera.width, camera.height)
+        camera = Camera.pinhole_from_fov(fov_x_deg, width, height)
     depth = None
     if truth.depth is not None:
-        ones = np.ones(truth.depth.shape[1:], np.float32)
-        depth = depth_errors((ones, *_true_depth(truth, int(row))) for row in rows)
+        step = _pixel_step(truth.depth, len(rows))
+        maps = (_true_depth(truth, int(row), step) for row in rows)
+        depth = depth_errors((np.ones(true.shape, np.float32), true, static) for true, static in maps)
     return _report(estimate, camera, depth, truth, rows)
 
 
@@ -131,7 +203,7 @@ def _report(
     return SequenceReport(
         coverage=len(rows) / len(truth.world_from_cam),
         trajectory=trajectory,
-        camera=camera_errors(camera, truth.camera),
+        camera=None if truth.camera is None else camera_errors(camera, truth.camera),
         depth=depth,
         depth_pose_ratio=depth_pose_scale_ratio(depth, trajectory),
     )
@@ -146,22 +218,33 @@ def _matching(frame_index: Sequence[int] | NDArray[np.int64], truth: GroundTruth
     return np.array(rows, dtype=np.int64)
 
 
-def _true_depth(truth: GroundTruth, row: int) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+def _pixel_step(depth: DepthFrames, num_frames: int) -> int:
+    """Every how many rows and columns to compare, to stay within `_MAX_DEPTH_VALUES`."""
+    return max(1, math.ceil(math.sqrt(num_frames * math.prod(depth.shape[1:]) / _MAX_DEPTH_VALUES)))
+
+
+def _true_depth(truth: GroundTruth, row: int, step: int) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
     assert truth.depth is not None
-    depth = truth.depth[row].astype(np.float32)
-    static = np.ones(depth.shape, np.bool_) if truth.dynamic is None else ~truth.dynamic[row]
+    depth = np.asarray(truth.depth[row], dtype=np.float32)[::step, ::step]
+    static = np.ones(depth.shape, np.bool_) if truth.dynamic is None else ~truth.dynamic[row][::step, ::step]
     return depth, static
 
 
 def _depth_pairs(
-    artifacts: Artifacts, truth: GroundTruth, rows: NDArray[np.int64]
+    estimate: Estimate,
+    maps: Iterable[NDArray[np.float32]],
+    truth: GroundTruth,
+    rows: NDArray[np.int64],
+    camera: Camera,
 ) -> Iterator[tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_]]]:
+    assert truth.depth is not None
     true_row = dict(rows.tolist())
-    with artifacts.open_depth() as reader:
-        for k, estimate in enumerate(reader):
-            if k not in true_row:
-                continue
-            depth, static = _true_depth(truth, true_row[k])
-            sampled = sample_depth(estimate, *depth.shape)
-            # The estimate's kind is made the truth's with the true camera: its error is judged apart.
-            yield convert_depth(sampled, truth.camera, artifacts.depth_kind, truth.depth_kind), depth, static
+    shape = truth.depth.shape[1:]
+    step = _pixel_step(truth.depth, len(rows))
+    # The estimate's kind is made the truth's with the true camera: its error is judged apart.
+    lens = camera if truth.camera is None else truth.camera
+    for k, depth in enumerate(maps):
+        if k not in true_row:
+            continue
+        sampled = convert_depth(sample_depth(depth, *shape), lens, estimate.depth_kind, truth.depth_kind)
+        yield sampled[::step, ::step], *_true_depth(truth, true_row[k], step)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 from vipe_core.errors import EmptyMedia, MediaNotFound
@@ -31,9 +32,11 @@ class ImageDirectorySource:
         name: Name of the sequence; the sanitised directory name if None.
         fps: Frame rate that gives the images their timestamps.
         stall_s: Seconds for one image after which the child is killed (DecodeTimeout).
+        files: Names of the images to take, in this order, where the directory holds others too; all in order of names
+            if None.
 
     Raises:
-        MediaNotFound: No such directory.
+        MediaNotFound: No such directory, or one of `files` is not in it.
         EmptyMedia: No image in it.
         CorruptMedia, MediaTooLarge: The first image; names it.
     """
@@ -46,13 +49,15 @@ class ImageDirectorySource:
         name: str | None = None,
         fps: float = IMAGE_FPS,
         stall_s: float = STALL_S,
+        files: Sequence[str] | None = None,
     ) -> None:
         if not fps > 0:
             raise ValueError(f"fps must be positive, got {fps}")
         self._limits = limits or Limits()
         self._stall_s = stall_s
         self._root = Path(path).absolute()
-        self._files = _list_images(self._root)
+        listed = _list_images(self._root)
+        self._files = listed if files is None else _choose(self._root, listed, files)
         self._limits.check_length(self._root.name, len(self._files), None)
         with DecoderProcess(
             self._request("probe", self._files[:1], fps, None, 0, None), self._root.name, stall_s, stall_s
@@ -133,3 +138,13 @@ def _list_images(root: Path) -> list[Path]:
         kinds = " ".join(sorted(IMAGE_SUFFIXES))
         raise EmptyMedia(f"{root.name}: the directory holds no image; supported are {kinds}")
     return files
+
+
+def _choose(root: Path, listed: list[Path], names: Sequence[str]) -> list[Path]:
+    by_name = {file.name: file for file in listed}
+    missing = next((name for name in names if name not in by_name), None)
+    if missing is not None:
+        raise MediaNotFound(f"{root.name}/{missing}: no such image; was the download cut short?")
+    if not names:
+        raise EmptyMedia(f"{root.name}: none of its images was chosen")
+    return [by_name[name] for name in names]
