@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import runpy
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -10,6 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
+from benchmarks import accuracy
 from vipe_core.annotation import Annotation, DenseFrame, Provenance, Quality
 from vipe_core.cameras import Camera, CameraModel
 from vipe_core.errors import FormatError
@@ -134,11 +134,9 @@ def test_the_accuracy_benchmark_prints_a_table(tmp_path: Path, capsys: pytest.Ca
         width=np.array(96),
         height=np.array(72),
     )
-    script = Path(__file__).resolve().parents[2] / "benchmarks" / "accuracy.py"
-    main = runpy.run_path(str(script))["main"]
-    assert main([str(sequence), "--artifacts", str(tmp_path / "out")]) == 0
+    assert accuracy.main([str(sequence), "--artifacts", str(tmp_path / "out")]) == 0
     assert "orbit" in capsys.readouterr().out
-    assert main([str(tmp_path / "nothing"), "--artifacts", str(tmp_path / "out")]) == 1
+    assert accuracy.main([str(tmp_path / "nothing"), "--artifacts", str(tmp_path / "out")]) == 1
     assert "nothing" in capsys.readouterr().err
 
 
