@@ -108,7 +108,9 @@ class Adjuster:
         poses = np.stack([keyframes.pose(k) for k in frames])
         depths = np.stack([keyframes.depth(k) for k in frames])
         measured = graph.read(edges, number, keyframes, self.device)
-        prior, prior_weight = self._depth_prior(keyframes, graph, frames, edges, number, depths)
+        prior = prior_weight = None
+        if free_depth and self.settings.terms.depth_prior:
+            prior, prior_weight = self._depth_prior(keyframes, graph, frames, edges, number, depths)
         problem = Problem(
             camera_model="pinhole",
             grid=keyframes.grid,
@@ -119,8 +121,8 @@ class Adjuster:
                 focal=free_focal,
             ),
             priors=Priors(
-                inverse_depth=prior if free_depth else None,
-                inverse_depth_weight=prior_weight if free_depth else None,
+                inverse_depth=prior,
+                inverse_depth_weight=prior_weight,
                 log_focal=self.focal_prior.log_focal if free_focal else None,
                 # Formal sigmas of dense measurements are too small because their errors are correlated. Dividing the
                 # prior's by the same factor weighs the two against each other as they really are.

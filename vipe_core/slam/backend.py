@@ -114,6 +114,8 @@ class Backend:
 
     def _mask_moving(self) -> bool:
         """Refresh the motion masks; whether any keyframe's mask changed by a visible share of its cells."""
+        if not self._settings.terms.motion_masks:
+            return False
         changed = 0.0
         threshold_px = 2 * self._adjuster.robust_scale_px
         for k in range(len(self._keyframes)):

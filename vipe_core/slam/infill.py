@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from vipe_core.ba.problem import Edges, Free, Problem, State
 from vipe_core.geometry.arrays import interpolate_trajectory
-from vipe_core.priors.protocols import DenseMatcher, Match
+from vipe_core.priors.protocols import DenseMatcher, Match, SparseTracker
 from vipe_core.slam.adjustment import Adjuster, Step
 from vipe_core.slam.graph import Graph
 from vipe_core.slam.keyframes import KeyframeMap
@@ -60,6 +60,7 @@ class Infill:
         graph: Says how raw weights are to be seen.
         batch: Frames that are posed together.
         rotation_only: Fits rotations instead of poses, for a camera that only turns.
+        tracks_only: Gives the measurements instead of dense flow, which then only guides it.
     """
 
     def __init__(
@@ -71,6 +72,7 @@ class Infill:
         reprojector: Reprojector,
         batch: int,
         rotation_only: RotationFitter | None = None,
+        tracks_only: SparseTracker | None = None,
     ) -> None:
         self._keyframes = keyframes
         self._graph = graph
@@ -79,6 +81,7 @@ class Infill:
         self._reprojector = reprojector
         self._batch = batch
         self._rotation_only = rotation_only
+        self._tracks_only = tracks_only
 
     def run(self, source: FrameSource, size: WorkingSize, times_s: Array, report: Report) -> Trajectory:
         """Decode the video once more and pose its frames; holds one batch of measurements at a time.
@@ -122,7 +125,10 @@ class Infill:
             guess = self._reprojector.induced(
                 self._keyframes.intrinsics, relative_pose(start, self._keyframes.pose(k)), self._keyframes.depth(k)
             )
-            matches.append((k, self._matcher.match_fast(self._keyframes.features[k], features, guess.target_px)))
+            match = self._matcher.match_fast(self._keyframes.features[k], features, guess.target_px)
+            if self._tracks_only is not None:
+                match = self._tracks_only.match(self._keyframes.features[k], features, match)
+            matches.append((k, match))
         return _Pending(index, np.array(start), tuple(matches))
 
     def _solve(self, pending: list[_Pending], poses: Array, inlier_ratio: Array) -> None:

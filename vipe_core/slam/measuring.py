@@ -2,14 +2,21 @@
 
 from __future__ import annotations
 
-from vipe_core.priors.protocols import DenseMatcher, SparseTracker
+from typing import Any
+
+from vipe_core.priors.protocols import DenseMatcher, Match, SparseTracker
 from vipe_core.slam.graph import Graph, fuse
 from vipe_core.slam.keyframes import KeyframeMap
 from vipe_core.slam.reprojection import Reprojector
 
 
 class MeasuredGraph:
-    """Matches pairs of keyframes, dense and sparse, and files both directions in the graph."""
+    """Matches pairs of keyframes, dense and sparse, and files both directions in the graph.
+
+    Args:
+        sparse: Gives the sparse term; None leaves it out.
+        dense_flow: Whether the dense term is filed, or only guides the sparse one.
+    """
 
     def __init__(
         self,
@@ -18,12 +25,15 @@ class MeasuredGraph:
         matcher: DenseMatcher,
         sparse: SparseTracker | None,
         reprojector: Reprojector,
+        *,
+        dense_flow: bool = True,
     ) -> None:
         self.keyframes = keyframes
         self.graph = graph
         self._matcher = matcher
         self._sparse = sparse
         self._reprojector = reprojector
+        self._dense_flow = dense_flow
 
     def connect(self, i: int, j: int, *, guided: bool, min_consistent: float = 0.0) -> float:
         """Measure i -> j and j -> i.
@@ -43,9 +53,12 @@ class MeasuredGraph:
         consistent = min(there.consistent, back.consistent)
         if consistent < min_consistent:
             return consistent
-        if self._sparse is not None:
-            there = fuse(there, self._sparse.match(source, target, there))
-            back = fuse(back, self._sparse.match(target, source, back))
-        self.graph.add(i, j, there)
-        self.graph.add(j, i, back)
+        self.graph.add(i, j, self._with_tracks(source, target, there))
+        self.graph.add(j, i, self._with_tracks(target, source, back))
         return consistent
+
+    def _with_tracks(self, source: Any, target: Any, dense: Match) -> Match:
+        if self._sparse is None:
+            return dense
+        sparse = self._sparse.match(source, target, dense)
+        return fuse(dense, sparse) if self._dense_flow else sparse

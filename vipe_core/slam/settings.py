@@ -5,7 +5,33 @@ Lengths are pixels of a working image that is 640 wide; `SlamSettings.scaled_px`
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+
+from vipe_core.errors import ConfigError
+
+
+@dataclass(frozen=True, slots=True)
+class EnergyTerms:
+    """Which terms of the energy are there (paper section 3.2): switches for the ablation of its table 4.
+
+    Attributes:
+        dense_flow: The dense flow term. Flow still guides the tracks and the choice of keyframes when it is off.
+        sparse_tracks: The sparse point term.
+        depth_prior: The inverse-depth prior.
+        motion_masks: Masks on things that move by themselves.
+
+    Raises:
+        ConfigError: Neither dense flow nor sparse tracks are on, so that nothing would be measured.
+    """
+
+    dense_flow: bool = True
+    sparse_tracks: bool = True
+    depth_prior: bool = True
+    motion_masks: bool = True
+
+    def __post_init__(self) -> None:
+        if not (self.dense_flow or self.sparse_tracks):
+            raise ConfigError("one of the terms dense_flow and sparse_tracks must be on")
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,6 +56,7 @@ class SlamSettings:
         focal_sigma_inflation: Factor on the solver's formal 1-sigma of log focal that makes it match real errors.
         focal_doubt_sigma: An inflated sigma above this makes the result doubtful.
         infill_batch: Frames posed in one motion-only adjustment.
+        terms: Which terms of the energy are there.
     """
 
     working_area_px: int = 640 * 480
@@ -49,6 +76,7 @@ class SlamSettings:
     focal_sigma_inflation: float = 6.0
     focal_doubt_sigma: float = 0.05
     infill_batch: int = 16
+    terms: EnergyTerms = field(default_factory=EnergyTerms)
 
     def scaled_px(self, length_px: float, working_width: int) -> float:
         """A length stated for a 640 px wide image, in pixels of the actual working image."""

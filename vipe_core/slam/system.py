@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from vipe_core.ba.problem import Grid
 from vipe_core.cameras import Camera
+from vipe_core.errors import ConfigError
 from vipe_core.geometry.arrays import inverse
 from vipe_core.priors.protocols import IntrinsicsEstimate, PriorFamily
 from vipe_core.slam.adjustment import Adjuster, FocalPrior
@@ -83,9 +84,15 @@ class SlamResult:
 
 
 class Slam:
-    """The stage with its components; reusable for any number of videos, one at a time."""
+    """The stage with its components; reusable for any number of videos, one at a time.
+
+    Raises:
+        ConfigError: The settings turn off the only measurements that the priors give.
+    """
 
     def __init__(self, priors: PriorFamily, settings: SlamSettings, device: torch.device) -> None:
+        if not settings.terms.dense_flow and priors.tracker is None:
+            raise ConfigError("the term dense_flow can only be off where the preset has sparse tracks")
         self._priors = priors
         self._settings = settings
         self._device = device
@@ -111,7 +118,15 @@ class Slam:
         graph = Graph()
         prior = FocalPrior(math.log(estimate.camera.focal_px), estimate.log_focal_sigma)
         adjuster = Adjuster(self._settings, self._device, prior, self._settings.scaled_px(1.0, size.width))
-        measured = MeasuredGraph(keyframes, graph, self._priors.matcher, self._priors.tracker, reprojector)
+        terms = self._settings.terms
+        measured = MeasuredGraph(
+            keyframes,
+            graph,
+            self._priors.matcher,
+            self._priors.tracker if terms.sparse_tracks else None,
+            reprojector,
+            dense_flow=terms.dense_flow,
+        )
         backend = Backend(measured, adjuster, reprojector, self._settings, size.width)
         static = selection.max_motion_px < self._settings.scaled_px(self._settings.static_motion_px, size.width)
         chosen = selection.keyframes[:1] if static else selection.keyframes
@@ -155,6 +170,7 @@ class Slam:
                     reprojector,
                     self._settings.infill_batch,
                     fitter if motion == "rotation" else None,
+                    tracks_only=None if terms.dense_flow else self._priors.tracker,
                 )
                 trajectory = infill.run(source, size, selection.timestamps_s, report)
                 cam_from_world, frame_inliers = trajectory.cam_from_world, trajectory.inlier_ratio
