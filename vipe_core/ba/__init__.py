@@ -14,7 +14,7 @@ from vipe_core.ba.problem import (
     Status,
 )
 from vipe_core.ba.reprojection import reproject, residuals
-from vipe_core.ba.torch_solver import Step
+from vipe_core.ba.solver import Step
 
 __all__ = [
     "Edges",

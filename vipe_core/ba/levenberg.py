@@ -7,15 +7,17 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from vipe_core.ba import robust
-from vipe_core.ba.plan import build_plan
+from vipe_core.ba.host_solver import HostSolver
 from vipe_core.ba.problem import Edges, Options, Problem, Result, State, Status
 from vipe_core.ba.reprojection import require_supported
-from vipe_core.ba.torch_solver import Cost, Step, TorchSolver
+from vipe_core.ba.solver import Cost, Solver, Step
+from vipe_core.ba.torch_solver import TorchSolver
 
 _MAX_DAMPING = 1e8
 # Single precision leaves errors of this size in the reduced system: less damping only makes it indefinite.
@@ -51,14 +53,13 @@ def solve(problem: Problem, state: State, options: Options | None = None) -> Res
     problem, state = _on_device(problem, state)
     if not _finite(problem, state):
         return Result(state, Status.NON_FINITE, 0, math.nan, math.nan, 0.0)
-    plan = build_plan(problem, state.inverse_depth.device)
-    solver = TorchSolver(problem, plan, options, state)
+    solver = _solver(problem, options, state)
     cost = solver.cost(state)
     measured, weight = _read(cost.measurements, cost.weight)
-    if not (plan.num_columns or plan.any_depth_free) or not weight > 0:
-        return Result(state, Status.EMPTY, 0, measured, measured, weight)
     if not math.isfinite(measured):
         return Result(state, Status.NON_FINITE, 0, measured, measured, weight)
+    if not solver.anything_free or not weight > 0:
+        return Result(state, Status.EMPTY, 0, measured, measured, weight)
     initial_cost = measured
 
     lost_rho = _lost_rho(options, cost)
@@ -95,7 +96,7 @@ def solve(problem: Problem, state: State, options: Options | None = None) -> Res
                 break
 
     variance = math.nan
-    if plan.focal_column is not None:
+    if solver.focal_free:
         if linearised_state is not state:
             system = solver.linearise(state)
         variances = _read(*(solver.log_focal_variance(system, damping) for damping in _SIGMA_DAMPINGS))
@@ -113,8 +114,13 @@ def newton_step(problem: Problem, state: State, options: Options | None = None, 
     """
     options = options or Options()
     problem, state = _on_device(problem, state)
-    solver = TorchSolver(problem, build_plan(problem, state.inverse_depth.device), options, state)
+    solver = _solver(problem, options, state)
     return solver.step(solver.linearise(state), damping)
+
+
+def _solver(problem: Problem, options: Options, state: State) -> Solver[Any]:
+    on_host = state.inverse_depth.device.type == "cpu"
+    return HostSolver(problem, options, state) if on_host else TorchSolver(problem, options, state)
 
 
 def _on_device(problem: Problem, state: State) -> tuple[Problem, State]:
@@ -137,11 +143,9 @@ def _on_device(problem: Problem, state: State) -> tuple[Problem, State]:
 
 
 def _finite(problem: Problem, state: State) -> bool:
-    """Whether every number that takes part is finite. A measurement without weight takes no part."""
-    edges, priors = problem.edges, problem.priors
+    """Whether state and priors are finite. Measurements with a weight that are not make the cost so."""
+    priors = problem.priors
     checks = [tensor.isfinite().all() for tensor in (state.cam_from_world, state.inverse_depth, state.intrinsics)]
-    checks.append(edges.weight.isfinite().all())
-    checks.append((edges.target_px.isfinite() | (edges.weight <= 0)).all())
     if priors.inverse_depth is not None and priors.inverse_depth_weight is not None:
         checks.append(priors.inverse_depth_weight.isfinite().all())
         checks.append((priors.inverse_depth.isfinite() | (priors.inverse_depth_weight <= 0)).all())

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from vipe_core.ba import robust
 from vipe_core.ba.problem import Options, Problem, State
-from vipe_core.ba.torch_solver import Step
+from vipe_core.ba.solver import Step
 from vipe_core.cameras import projection
 from vipe_core.geometry import se3
 

@@ -1,4 +1,6 @@
-"""The normal equations of dense bundle adjustment, reduced to poses and intrinsics, on any torch device.
+"""The normal equations of dense bundle adjustment, reduced to poses and intrinsics, in torch: the solver for a GPU.
+
+On a CPU `host_solver.py` does the same with compiled loops.
 
 Problem. Minimise over poses G_i = cam_from_world, intrinsics k = (log f, alpha) and one inverse depth d per cell
 
@@ -46,60 +48,16 @@ import torch
 from torch import Tensor
 
 from vipe_core.ba import robust
-from vipe_core.ba.plan import Chunk, Plan
+from vipe_core.ba.plan import Chunk, build_plan
 from vipe_core.ba.problem import Options, Problem, State
 from vipe_core.ba.reprojection import min_depth_factor
+from vipe_core.ba.solver import ALPHA_RANGE, MAX_LOG_FOCAL_STEP, MIN_CURVATURE, Cost, Step
 from vipe_core.cameras import projection
 from vipe_core.geometry import se3
 
-# Largest change of log f in one step: beyond, the linearisation says nothing.
-_MAX_LOG_FOCAL_STEP = 0.3
-_ALPHA_RANGE = (0.0, 1.2)
 # What is kept between passes (sorted measurements, factors of the elimination) up to this size, else made again.
 _CPU_KEEP_BYTES = 1 << 30
 _GPU_KEEP_BYTES = 1 << 34
-
-
-@dataclass(frozen=True, slots=True)
-class Cost:
-    """Sums over all measurements, 0-dim float64 tensors.
-
-    Attributes:
-        measurements: sum of wmax rho(s) where valid, px^2.
-        weight: sum of wmax where valid.
-        lost_weight: sum of wmax where the point is not in front of the target camera.
-        priors: Cost of the priors.
-    """
-
-    measurements: Tensor
-    weight: Tensor
-    lost_weight: Tensor
-    priors: Tensor
-
-    def total(self, lost_rho: Tensor) -> Tensor:
-        """What a step must lower. Lost measurements cost `lost_rho` each, else losing them all would be best."""
-        return self.measurements + self.priors + lost_rho * self.lost_weight
-
-
-@dataclass(frozen=True, slots=True)
-class Step:
-    """An update of the state.
-
-    Attributes:
-        pose: (N, 6) float64 left twists of cam_from_world (translation, rotation).
-        log_focal: 0-dim float64.
-        alpha: 0-dim float64.
-        inverse_depth: (N, P), before clamping.
-        predicted_drop: 0-dim float64, g^T step: how much the undamped quadratic model expects to gain.
-        factorised: 0-dim bool, whether the reduced system was positive definite; otherwise the step is not finite.
-    """
-
-    pose: Tensor
-    log_focal: Tensor
-    alpha: Tensor
-    inverse_depth: Tensor
-    predicted_drop: Tensor
-    factorised: Tensor
 
 
 @dataclass(frozen=True, slots=True)
@@ -178,9 +136,12 @@ class _Geometry:
 class TorchSolver:
     """Cost, linearisation and step of one problem. Built once per solve; holds no state of the unknowns."""
 
-    def __init__(self, problem: Problem, plan: Plan, options: Options, state: State) -> None:
-        self.problem, self.plan, self.options = problem, plan, options
+    def __init__(self, problem: Problem, options: Options, state: State) -> None:
+        self.problem, self.options = problem, options
         self.dtype, self.device = state.inverse_depth.dtype, state.inverse_depth.device
+        self.plan = plan = build_plan(problem, self.device)
+        self.focal_free = plan.focal_column is not None
+        self.anything_free = plan.num_columns > 0 or plan.any_depth_free
         self._sample_px = problem.grid.sample_px(device=self.device)
         median = state.inverse_depth.median()
         self._depth_range = (options.min_inverse_depth * median, options.max_inverse_depth * median)
@@ -383,7 +344,7 @@ class TorchSolver:
         matrix, gradient = reduced[:-1, :-1], reduced[:-1, -1]
         diagonal = matrix.diagonal()
         # A column without any curvature has no gradient either: scaled to a unit row, it does not move.
-        known = diagonal > 1e-12 * system.direct[:-1, :-1].diagonal()
+        known = diagonal > MIN_CURVATURE * system.direct[:-1, :-1].diagonal()
         scale = torch.where(known, diagonal, 1).rsqrt() * known
         scaled = matrix * scale[:, None] * scale
         scaled.diagonal().add_(damping + (~known).double())
@@ -399,12 +360,12 @@ class TorchSolver:
         log_focal, alpha = zero[0], zero[0]
         intrinsics = []
         if (column := self.plan.focal_column) is not None:
-            log_focal = solution[column].clamp(-_MAX_LOG_FOCAL_STEP, _MAX_LOG_FOCAL_STEP)
+            log_focal = solution[column].clamp(-MAX_LOG_FOCAL_STEP, MAX_LOG_FOCAL_STEP)
             solution[column] = log_focal
             intrinsics.append(log_focal)
         if (column := self.plan.alpha_column) is not None:
             current = system.state.intrinsics[4]
-            alpha = (current + solution[column]).clamp(*_ALPHA_RANGE) - current
+            alpha = (current + solution[column]).clamp(*ALPHA_RANGE) - current
             solution[column] = alpha
             intrinsics.append(alpha)
         pose = torch.cat((solution, zero, zero))[self.plan.pose_columns]

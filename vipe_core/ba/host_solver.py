@@ -1,0 +1,352 @@
+"""The solver of bundle adjustment for a CPU: compiled loops and a sparse reduced system.
+
+The same problem and the same step as `torch_solver.py`, which documents the algebra. The reduced system is stored as
+6x6 blocks in the structure of its Cholesky factor, one block row per free pose and one for the intrinsics, so memory
+grows with the edges and not with the square of the frames.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from vipe_core.ba import block_cholesky, kernels
+from vipe_core.ba.problem import Options, Problem, State
+from vipe_core.ba.reduced import add_twists, damp
+from vipe_core.ba.reprojection import min_depth_factor
+from vipe_core.ba.solver import ALPHA_RANGE, MAX_LOG_FOCAL_STEP, Cost, Step
+from vipe_core.cameras import projection
+from vipe_core.geometry import se3
+
+Array = NDArray[Any]
+
+# Less work than this many edge cells is not worth waking another thread for.
+_CELLS_PER_THREAD = 1 << 16
+
+
+@dataclass(frozen=True, slots=True)
+class HostSystem:
+    """The normal equations at a state, in the structure of the factor.
+
+    Attributes:
+        direct: (B, 6, 6) float64 J^T J of poses and intrinsics.
+        eliminated: The same shape: what eliminating the undamped depths subtracts.
+        direct_gradient: (nodes, 6) float64 -J^T r, in order of elimination.
+        eliminated_gradient: The same shape.
+        pose: What the kernels need of the state.
+        adjoint: (E, 6, 6) of target_from_source, edges in order.
+        state: Where.
+        cost: By-product of the linearisation.
+    """
+
+    direct: Array
+    eliminated: Array
+    direct_gradient: Array
+    eliminated_gradient: Array
+    pose: kernels.Pose
+    adjoint: Array
+    state: State
+    cost: Cost
+
+
+class HostSolver:
+    """Cost, linearisation and step of one problem on the CPU. Built once per solve; holds no state of the unknowns."""
+
+    def __init__(self, problem: Problem, options: Options, state: State) -> None:
+        self.problem, self.options = problem, options
+        dtype = state.inverse_depth.dtype
+        self._dtype = dtype
+        edges, free = problem.edges, problem.free
+        num_frames = len(free.poses)
+        order = torch.argsort(edges.source * num_frames + edges.target, stable=True)
+        self._source, self._target = edges.source[order], edges.target[order]
+        degree = torch.bincount(edges.source, minlength=num_frames)
+        first = np.zeros(num_frames + 1, np.int64)
+        np.cumsum(degree.numpy(), out=first[1:])
+        depth_free = (free.inverse_depth.cpu() & (degree > 0)).numpy()
+        self._depth_free = depth_free
+        self._graph = kernels.Graph(
+            first=first,
+            edge=order.numpy(),
+            target_px=_flat(edges.target_px, dtype),
+            weight=_flat(edges.weight, dtype),
+            depth_free=depth_free,
+        )
+        size = np.where(depth_free, 6 * degree.numpy() + kernels.TAIL, 0)
+        self._offset = np.zeros(num_frames + 1, np.int64)
+        np.cumsum(size * size, out=self._offset[1:])
+        self._prior = self._depth_prior(dtype)
+
+        touched = torch.zeros(num_frames, dtype=torch.bool)
+        touched[edges.source] = True
+        touched[edges.target] = True
+        self._nodes = torch.nonzero(free.poses.cpu() & touched)[:, 0].numpy()
+        self._free = np.array((free.focal, free.distortion and problem.camera_model == "mei"))
+        self.focal_free = free.focal
+        self.anything_free = bool(len(self._nodes) or self._free.any() or depth_free.any())
+        self._structure = self._analyse()
+        self._place = np.full(num_frames, -1, np.int64)
+        self._place[self._nodes] = self._structure.place[: len(self._nodes)]
+        self._shared = len(self._nodes) if self._free.any() else -1
+
+        self._kernel = kernels.ROBUST_CODE[options.robust]
+        self._sample_px = problem.grid.sample_px()
+        self._rays: tuple[Tensor, Array, Array, Array] | None = None
+        median = state.inverse_depth.median()
+        self._depth_range = (options.min_inverse_depth * median, options.max_inverse_depth * median)
+        cells = len(self._source) * problem.grid.num_cells
+        self._threads = max(1, min(torch.get_num_threads(), cells // _CELLS_PER_THREAD))
+
+    def _depth_prior(self, dtype: torch.dtype) -> kernels.DepthPrior:
+        priors = self.problem.priors
+        if priors.inverse_depth is None or priors.inverse_depth_weight is None:
+            nothing = torch.empty(0, self.problem.grid.num_cells, dtype=dtype).numpy()
+            return kernels.DepthPrior(nothing, nothing)
+        return kernels.DepthPrior(
+            priors.inverse_depth.to(dtype).contiguous().numpy(),
+            priors.inverse_depth_weight.to(dtype).contiguous().numpy(),
+        )
+
+    def _analyse(self) -> block_cholesky.Structure:
+        """A frame with free depths couples all poses that see it; an edge with fixed ones couples two."""
+        number = np.full(len(self._depth_free), -1, np.int64)
+        number[self._nodes] = np.arange(len(self._nodes))
+        source, target = number[self._source.numpy()], number[self._target.numpy()]
+        cliques: list[list[int]] = []
+        first = self._graph.first
+        for frame, free in enumerate(self._depth_free):
+            begin, end = first[frame], first[frame + 1]
+            if free:
+                cliques.append([node for node in (number[frame], *target[begin:end]) if node >= 0])
+            elif number[frame] >= 0:
+                cliques += [[i, j] for i, j in zip(source[begin:end], target[begin:end], strict=True) if j >= 0]
+        return block_cholesky.analyse(len(self._nodes), cliques, dense_last=bool(self._free.any()))
+
+    # -- state -----------------------------------------------------------------------------------------------------
+
+    def _pose(self, state: State) -> tuple[kernels.Pose, Tensor]:
+        """What the kernels need of a state, and the transforms of the edges."""
+        model, intrinsics = self.problem.camera_model, state.intrinsics
+        transform = se3.relative(state.cam_from_world[self._target], state.cam_from_world[self._source])
+        if self._rays is None or not torch.equal(self._rays[0], intrinsics):
+            rays = projection.unproject(model, intrinsics, self._sample_px)
+            by_intrinsics = projection.unproject_jacobian(model, intrinsics, self._sample_px)
+            least = min_depth_factor(model, intrinsics, self._sample_px, rays, self.options.min_depth_ratio)
+            both = torch.zeros(2, 3, len(rays), dtype=self._dtype)
+            both[: by_intrinsics.shape[2]] = by_intrinsics.permute(2, 1, 0)
+            planar = rays.T.to(self._dtype).contiguous()
+            self._rays = (intrinsics.clone(), planar.numpy(), both.numpy(), least.to(self._dtype).numpy())
+        camera = torch.zeros(5, dtype=self._dtype)
+        camera[: len(intrinsics)] = intrinsics
+        return (
+            kernels.Pose(
+                transform=transform[:, :3].flatten(1).to(self._dtype).contiguous().numpy(),
+                rays=self._rays[1],
+                rays_by_intrinsics=self._rays[2],
+                min_s=self._rays[3],
+                inverse_depth=state.inverse_depth.contiguous().numpy(),
+                camera=camera.numpy(),
+            ),
+            transform,
+        )
+
+    def _over_frames(self, work: Callable[[int, int], None]) -> None:
+        """Run `work(begin, end)` over all frames, in ranges of about as many edges each where there are threads."""
+        first = self._graph.first
+        if self._threads == 1:
+            work(0, len(first) - 1)
+            return
+        shares = np.linspace(0, first[-1], 4 * self._threads + 1)
+        bounds = np.unique(np.concatenate(([0], np.searchsorted(first, shares[1:-1]), [len(first) - 1])))
+        with ThreadPoolExecutor(self._threads) as pool:
+            for done in [pool.submit(work, begin, end) for begin, end in pairwise(bounds.tolist())]:
+                done.result()
+
+    def _scale(self) -> Array:
+        return np.full(1, self.options.robust_scale_px**2, self._numpy_dtype)
+
+    @property
+    def _numpy_dtype(self) -> np.dtype[Any]:
+        return self._graph.weight.dtype
+
+    def _cost(self, sums: Array, state: State) -> Cost:
+        measurements, weight, everything, prior = sums.sum(axis=0).tolist()
+        priors = self.problem.priors
+        if priors.log_focal is not None and self.focal_free:
+            prior += ((np.log(float(state.intrinsics[0])) - priors.log_focal) / priors.log_focal_sigma) ** 2
+        return Cost(*torch.tensor([measurements, weight, everything - weight, prior], dtype=torch.float64))
+
+    # -- the solver's interface ------------------------------------------------------------------------------------
+
+    def cost(self, state: State) -> Cost:
+        """The robust cost at a state."""
+        pose, _ = self._pose(state)
+        sums, scale = np.zeros((len(self._depth_free), 4)), self._scale()
+        self._over_frames(
+            lambda begin, end: kernels.evaluate(self._graph, pose, self._prior, self._kernel, scale, begin, end, sums)
+        )
+        return self._cost(sums, state)
+
+    def linearise(self, state: State) -> HostSystem:
+        """The normal equations at a state."""
+        pose, transform = self._pose(state)
+        graph, structure, scale = self._graph, self._structure, self._scale()
+        sums = np.zeros((len(self._depth_free), 4))
+        per_edge = np.zeros(kernels.ROWS**2 * len(self._source))
+        per_frame = np.zeros(self._offset[-1])
+        self._over_frames(
+            lambda begin, end: kernels.linearise(
+                graph,
+                pose,
+                self._prior,
+                self._kernel,
+                scale,
+                self._free,
+                begin,
+                end,
+                sums,
+                per_edge,
+                self._offset,
+                per_frame,
+            )
+        )
+        adjoint = se3.adjoint(transform).contiguous().numpy()
+        direct = np.zeros((structure.num_blocks, 6, 6))
+        direct_gradient = np.zeros((structure.num_nodes, 6))
+        eliminated, eliminated_gradient = np.zeros_like(direct), np.zeros_like(direct_gradient)
+        place = self._place
+        source, target = place[self._source.numpy()], place[self._target.numpy()]
+
+        def add(group: Array, offset: Array, matrices: Array, blocks: Array, gradient: Array) -> None:
+            add_twists(
+                structure.first,
+                structure.rows,
+                group,
+                source,
+                target,
+                self._shared,
+                adjoint,
+                offset,
+                matrices,
+                blocks,
+                gradient,
+            )
+
+        singly = np.arange(len(source) + 1)
+        add(singly, kernels.ROWS**2 * singly, per_edge, direct, direct_gradient)
+        add(graph.first, self._offset, per_frame, eliminated, eliminated_gradient)
+        priors = self.problem.priors
+        if priors.log_focal is not None and self.focal_free:
+            information = 1 / priors.log_focal_sigma**2
+            direct[-1, 0, 0] += information
+            direct_gradient[-1, 0] += information * (priors.log_focal - np.log(float(state.intrinsics[0])))
+        return HostSystem(
+            direct,
+            eliminated,
+            direct_gradient,
+            eliminated_gradient,
+            pose,
+            adjoint,
+            state,
+            self._cost(sums, state),
+        )
+
+    def _factorise(self, system: HostSystem, damping: float) -> tuple[Array, Array, bool]:
+        """Scale (nodes, 6), factor, and success of the damped, scaled reduced system."""
+        structure = self._structure
+        factor = np.empty_like(system.direct)
+        scale = np.empty_like(system.direct_gradient)
+        damp(structure.first, structure.rows, system.direct, system.eliminated, damping, factor, scale)
+        return scale, factor, bool(block_cholesky.factorise(structure.first, structure.rows, factor))
+
+    def step(self, system: HostSystem, damping: float) -> Step:
+        """Solve the damped system: reduced system first, then every inverse depth."""
+        structure, state = self._structure, system.state
+        scale, factor, factorised = self._factorise(system, damping)
+        solution = (system.direct_gradient - system.eliminated_gradient / (1 + damping)) * scale
+        if factorised:
+            block_cholesky.substitute(structure.first, structure.rows, factor, solution)
+            solution *= scale
+        else:
+            solution[:] = np.nan
+        log_focal = alpha = 0.0
+        if self.focal_free:
+            log_focal = float(np.clip(solution[-1, 0], -MAX_LOG_FOCAL_STEP, MAX_LOG_FOCAL_STEP))
+            solution[-1, 0] = log_focal
+        if self._free[1]:
+            current = float(state.intrinsics[4])
+            alpha = float(np.clip(current + solution[-1, 1], *ALPHA_RANGE)) - current
+            solution[-1, 1] = alpha
+        pose = np.zeros((len(self._place), 6))
+        pose[self._nodes] = solution[self._place[self._nodes]]
+        predicted_drop = float((system.direct_gradient * solution).sum())
+
+        depth = torch.zeros_like(state.inverse_depth)
+        if factorised and self._depth_free.any():
+            twist = np.empty((len(self._source), 8), self._numpy_dtype)
+            moved = (system.adjoint @ pose[self._source.numpy()][:, :, None])[:, :, 0]
+            twist[:, :6] = pose[self._target.numpy()] - moved
+            twist[:, 6], twist[:, 7] = log_focal, alpha
+            gain = np.empty(len(self._depth_free))
+            damping_of = np.full(1, damping, self._numpy_dtype)
+            scale_px = self._scale()
+            out = depth.numpy()
+            self._over_frames(
+                lambda begin, end: kernels.back_substitute(
+                    self._graph,
+                    system.pose,
+                    self._prior,
+                    self._kernel,
+                    scale_px,
+                    twist,
+                    damping_of,
+                    begin,
+                    end,
+                    out,
+                    gain,
+                )
+            )
+            predicted_drop += float(gain.sum())
+        return Step(
+            pose=torch.from_numpy(pose),
+            log_focal=torch.tensor(log_focal, dtype=torch.float64),
+            alpha=torch.tensor(alpha, dtype=torch.float64),
+            inverse_depth=depth,
+            predicted_drop=torch.tensor(predicted_drop, dtype=torch.float64),
+            factorised=torch.tensor(factorised),
+        )
+
+    def retract(self, state: State, step: Step) -> State:
+        """The state after a step. Whatever the step does not touch keeps its bits."""
+        intrinsics = state.intrinsics.clone()
+        intrinsics[:2] *= step.log_focal.exp()
+        if self._free[1]:
+            intrinsics[4] += step.alpha
+        inverse_depth = (state.inverse_depth + step.inverse_depth).clamp_(*self._depth_range)
+        held = torch.from_numpy(~self._depth_free)
+        inverse_depth[held] = state.inverse_depth[held]
+        return State(se3.exp(step.pose) @ state.cam_from_world, inverse_depth, intrinsics)
+
+    def log_focal_variance(self, system: HostSystem, damping: float) -> Tensor:
+        """Variance of log f with everything else marginalised; NaN where the damped system is singular. 0-dim."""
+        scale, factor, factorised = self._factorise(system, damping)
+        variance = np.nan
+        if factorised and scale[-1, 0] > 0:
+            unit = np.zeros_like(scale)
+            unit[-1, 0] = scale[-1, 0]
+            block_cholesky.substitute(self._structure.first, self._structure.rows, factor, unit)
+            variance = float(scale[-1, 0] * unit[-1, 0])
+        return torch.tensor(variance, dtype=torch.float64)
+
+
+def _flat(measurements: Tensor, dtype: torch.dtype) -> Array:
+    """(E, P, 2) -> (E, 2 P) without a copy where it has that layout and type."""
+    return np.asarray(measurements.to(dtype).contiguous().flatten(1).numpy())

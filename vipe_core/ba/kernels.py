@@ -1,0 +1,503 @@
+"""Compiled loops over the cells of the edges: cost, normal equations, and the step of every inverse depth.
+
+The algebra is that of `torch_solver.py`; what differs is the order of the work. A source frame is taken in tiles of
+`TILE` cells, every edge of it one after the other, so that all intermediate rows stay in the first two cache levels and
+nothing per edge and cell is ever stored: the step of the depths sees the measurements again instead.
+
+Pinhole is the unified model with alpha = 0. Pixel arithmetic is in the dtype of the inverse depths, sums are in it
+within a tile and in float64 across tiles. Frames are independent, so any split over threads gives the same bytes.
+
+Everything is planar: a row of a tile is `TILE` consecutive numbers of a flat buffer, since loops over rows at constant
+distances are the ones that compile to vector code.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vipe_core.compilation import vectorised
+
+Array = NDArray[Any]
+
+TILE = 256
+# Rows of an edge: 6 of its twist, log f, alpha, negative residual.
+ROWS = 9
+TAIL = 3
+ROBUST_CODE = {"none": 0, "huber": 1, "cauchy": 2, "geman_mcclure": 3}
+
+# Rows of the view buffer: homogeneous point, 1 / s, projection before focal length and centre, |X|, weighted residual,
+# roots of the weights, argument of the robust kernel, larger weight. Zero weights where the point is not imaged.
+_X, _Y, _Z, _INV, _PX, _PY, _NORM, _EU, _EV, _SU, _SV, _SQ, _WM = (k * TILE for k in range(13))
+_VIEW_SIZE = 13 * TILE
+# Rows of the Jacobian buffer: ROWS pairs (u, v), then the derivative by inverse depth, then J_X.
+_RHS = 16 * TILE
+_BY_DEPTH = 18 * TILE
+_BY_POINT = 20 * TILE
+_JACOBIAN_SIZE = 26 * TILE
+
+
+class Graph(NamedTuple):
+    """Edges in order of (source, target): `edge` (E,) numbers the problem's, those of frame i are first[i]:first[i+1].
+
+    target_px and weight are (E, 2 P) in the problem's order, (u, v) alternating; depth_free (N,) bool.
+    """
+
+    first: Array
+    edge: Array
+    target_px: Array
+    weight: Array
+    depth_free: Array
+
+
+class Pose(NamedTuple):
+    """A state: transform (E, 12) rows of [R | t] in order, rays (3, P), their derivatives (2, 3, P), min_s (P,).
+
+    inverse_depth (N, P), camera (fx, fy, cx, cy, alpha), all of one dtype.
+    """
+
+    transform: Array
+    rays: Array
+    rays_by_intrinsics: Array
+    min_s: Array
+    inverse_depth: Array
+    camera: Array
+
+
+class DepthPrior(NamedTuple):
+    """Value and information, (N, P), or (0, P) without a prior."""
+
+    value: Array
+    weight: Array
+
+
+@vectorised
+def _see(graph: Graph, pose: Pose, frame: int, order: int, start: int, n: int, view: Array) -> Any:
+    """Fill the view of an edge's tile; returns the sum of the larger weights, imaged or not."""
+    row, edge = pose.transform[order], graph.edge[order]
+    target, weight = graph.target_px[edge][2 * start : 2 * (start + n)], graph.weight[edge][2 * start : 2 * (start + n)]
+    rx, ry, rz = pose.rays[0][start:], pose.rays[1][start:], pose.rays[2][start:]
+    depth, least = pose.inverse_depth[frame][start:], pose.min_s[start:]
+    fx, fy, cx, cy, alpha = pose.camera[0], pose.camera[1], pose.camera[2], pose.camera[3], pose.camera[4]
+    r00, r01, r02, t0 = row[0], row[1], row[2], row[3]
+    r10, r11, r12, t1 = row[4], row[5], row[6], row[7]
+    r20, r21, r22, t2 = row[8], row[9], row[10], row[11]
+    zero, one, tiny = view.dtype.type(0), view.dtype.type(1), view.dtype.type(1e-37)
+    total = zero
+    for p in range(n):
+        a, b, c, d = rx[p], ry[p], rz[p], depth[p]
+        x = r00 * a + r01 * b + r02 * c + t0 * d
+        y = r10 * a + r11 * b + r12 * c + t1 * d
+        z = r20 * a + r21 * b + r22 * c + t2 * d
+        norm = math.sqrt(x * x + y * y + z * z)
+        s = z + alpha * norm
+        imaged = (s > least[p]) & (alpha * z + norm > zero)
+        wu, wv, tu, tv = weight[2 * p], weight[2 * p + 1], target[2 * p], target[2 * p + 1]
+        wu = zero if wu < zero else wu
+        wv = zero if wv < zero else wv
+        inverse = one / (s if imaged else one)
+        px, py = x * inverse, y * inverse
+        eu, ev = fx * px + cx - tu, fy * py + cy - tv
+        # A component without weight has no say, whatever it holds.
+        eu = eu if wu > zero else zero
+        ev = ev if wv > zero else zero
+        wm = wu if wu > wv else wv
+        total += wm
+        wu = wu if imaged else zero
+        wv = wv if imaged else zero
+        wm = wm if imaged else zero
+        su, sv = math.sqrt(wu), math.sqrt(wv)
+        eu, ev = eu * su, ev * sv
+        view[_X + p], view[_Y + p], view[_Z + p], view[_INV + p] = x, y, z, inverse
+        view[_PX + p], view[_PY + p], view[_NORM + p] = px, py, norm if imaged else one
+        view[_EU + p], view[_EV + p], view[_SU + p], view[_SV + p] = eu, ev, su, sv
+        view[_SQ + p] = (eu * eu + ev * ev) / (wm if wm > tiny else tiny)
+        view[_WM + p] = wm
+    return total
+
+
+@vectorised
+def _rho_sum(kernel: int, c2: float, view: Array, n: int) -> tuple[float, float]:
+    """Sums of wmax rho(s) and of wmax over a tile."""
+    squared, weight = view[_SQ : _SQ + TILE], view[_WM : _WM + TILE]
+    zero = view.dtype.type(0)
+    two = view.dtype.type(2)
+    total, kept = zero, zero
+    for p in range(n):
+        kept += weight[p]
+    if kernel == 0:
+        for p in range(n):
+            total += weight[p] * squared[p]
+    elif kernel == 1:
+        c = math.sqrt(c2)
+        for p in range(n):
+            s = squared[p]
+            total += weight[p] * (two * c * math.sqrt(s) - c2 if s > c2 else s)
+    elif kernel == 2:
+        for p in range(n):
+            total += weight[p] * c2 * math.log1p(squared[p] / c2)
+    else:
+        for p in range(n):
+            total += weight[p] * (squared[p] * c2 / (c2 + squared[p]))
+    return total, kept
+
+
+@vectorised
+def _reweigh(kernel: int, c2: float, view: Array, n: int) -> None:
+    """Scale residuals and roots of weights by sqrt(rho'(s))."""
+    if kernel == 0:
+        return
+    one = view.dtype.type(1)
+    squared = view[_SQ : _SQ + TILE]
+    if kernel == 1:
+        for p in range(n):
+            s = squared[p]
+            squared[p] = math.sqrt(math.sqrt(c2 / (s if s > c2 else c2)))
+    elif kernel == 2:
+        for p in range(n):
+            squared[p] = one / math.sqrt(one + squared[p] / c2)
+    else:
+        for p in range(n):
+            squared[p] = c2 / (c2 + squared[p])
+    for p in range(n):
+        root = view[_SQ + p]
+        view[_EU + p] *= root
+        view[_EV + p] *= root
+        view[_SU + p] *= root
+        view[_SV + p] *= root
+
+
+@vectorised
+def _differentiate(
+    pose: Pose, frame: int, order: int, start: int, n: int, free: Array, view: Array, jacobian: Array
+) -> None:
+    """Scaled rows of a reweighed tile, with zeros after its last cell."""
+    row = pose.transform[order]
+    depth = pose.inverse_depth[frame][start:]
+    fx, fy, alpha = pose.camera[0], pose.camera[1], pose.camera[4]
+    t0, t1, t2 = row[3], row[7], row[11]
+    one = view.dtype.type(1)
+    for p in range(n):
+        gu, gv = view[_SU + p] * fx * view[_INV + p], view[_SV + p] * fy * view[_INV + p]
+        x, y, z, px, py, d = view[_X + p], view[_Y + p], view[_Z + p], view[_PX + p], view[_PY + p], depth[p]
+        bend = alpha / view[_NORM + p]
+        hx, hy, hz = bend * x, bend * y, one + bend * z
+        au, av = gu * px, gv * py
+        u0, u1, u2 = gu - au * hx, -au * hy, -au * hz
+        v0, v1, v2 = -av * hx, gv - av * hy, -av * hz
+        jacobian[p], jacobian[TILE + p] = d * u0, d * v0
+        jacobian[2 * TILE + p], jacobian[3 * TILE + p] = d * u1, d * v1
+        jacobian[4 * TILE + p], jacobian[5 * TILE + p] = d * u2, d * v2
+        jacobian[6 * TILE + p], jacobian[7 * TILE + p] = y * u2 - z * u1, y * v2 - z * v1
+        jacobian[8 * TILE + p], jacobian[9 * TILE + p] = z * u0 - x * u2, z * v0 - x * v2
+        jacobian[10 * TILE + p], jacobian[11 * TILE + p] = x * u1 - y * u0, x * v1 - y * v0
+        jacobian[_RHS + p], jacobian[_RHS + TILE + p] = -view[_EU + p], -view[_EV + p]
+        jacobian[_BY_DEPTH + p] = t0 * u0 + t1 * u1 + t2 * u2
+        jacobian[_BY_DEPTH + TILE + p] = t0 * v0 + t1 * v1 + t2 * v2
+        jacobian[_BY_POINT + p], jacobian[_BY_POINT + TILE + p] = u0, v0
+        jacobian[_BY_POINT + 2 * TILE + p], jacobian[_BY_POINT + 3 * TILE + p] = u1, v1
+        jacobian[_BY_POINT + 4 * TILE + p], jacobian[_BY_POINT + 5 * TILE + p] = u2, v2
+    for k in range(2):
+        if free[k]:
+            _intrinsic_row(pose, row, k, start, n, view, jacobian)
+    if n < TILE:
+        for r in range(20):
+            for p in range(n, TILE):
+                jacobian[r * TILE + p] = view.dtype.type(0)
+
+
+@vectorised
+def _intrinsic_row(pose: Pose, row: Array, k: int, start: int, n: int, view: Array, jacobian: Array) -> None:
+    """The row of log f (k = 0) or alpha (k = 1): J_X R d ray / dk + d project / dk."""
+    rays = pose.rays_by_intrinsics[k]
+    rx, ry, rz = rays[0][start:], rays[1][start:], rays[2][start:]
+    fx, fy = pose.camera[0], pose.camera[1]
+    r00, r01, r02, r10, r11, r12 = row[0], row[1], row[2], row[4], row[5], row[6]
+    r20, r21, r22 = row[8], row[9], row[10]
+    by_point = jacobian[_BY_POINT : _BY_POINT + 6 * TILE]
+    out = jacobian[(12 + 2 * k) * TILE : (14 + 2 * k) * TILE]
+    for p in range(n):
+        a, b, c = rx[p], ry[p], rz[p]
+        x, y, z = r00 * a + r01 * b + r02 * c, r10 * a + r11 * b + r12 * c, r20 * a + r21 * b + r22 * c
+        # Both camera derivatives are multiples of f px: by 1 for log f, by -|X| / s for alpha.
+        share = -view[_NORM + p] * view[_INV + p] if k == 1 else view.dtype.type(1)
+        u = x * by_point[p] + y * by_point[2 * TILE + p] + z * by_point[4 * TILE + p]
+        v = x * by_point[TILE + p] + y * by_point[3 * TILE + p] + z * by_point[5 * TILE + p]
+        out[p] = u + share * (view[_SU + p] * fx * view[_PX + p])
+        out[TILE + p] = v + share * (view[_SV + p] * fy * view[_PY + p])
+
+
+@vectorised
+def _gram(rows: Array, triples: int, length: int, total: Array, offset: int) -> None:
+    """Add rows rows^T to the lower 3x3 blocks of a matrix, for 3 `triples` rows of `length` in a flat buffer.
+
+    The matrix is `total` from `offset` on, row by row.
+    """
+    zero, width = rows.dtype.type(0), 3 * triples
+    for i in range(triples):
+        base = 3 * i * length
+        a0, a1 = rows[base : base + length], rows[base + length : base + 2 * length]
+        a2 = rows[base + 2 * length : base + 3 * length]
+        for j in range(i + 1):
+            other = 3 * j * length
+            b0, b1 = rows[other : other + length], rows[other + length : other + 2 * length]
+            b2 = rows[other + 2 * length : other + 3 * length]
+            s00, s01, s02, s10, s11, s12, s20, s21, s22 = zero, zero, zero, zero, zero, zero, zero, zero, zero
+            for p in range(length):
+                x0, x1, x2, y0, y1, y2 = a0[p], a1[p], a2[p], b0[p], b1[p], b2[p]
+                s00 += x0 * y0
+                s01 += x0 * y1
+                s02 += x0 * y2
+                s10 += x1 * y0
+                s11 += x1 * y1
+                s12 += x1 * y2
+                s20 += x2 * y0
+                s21 += x2 * y1
+                s22 += x2 * y2
+            at = offset + 3 * i * width + 3 * j
+            total[at] += s00
+            total[at + 1] += s01
+            total[at + 2] += s02
+            total[at + width] += s10
+            total[at + width + 1] += s11
+            total[at + width + 2] += s12
+            total[at + 2 * width] += s20
+            total[at + 2 * width + 1] += s21
+            total[at + 2 * width + 2] += s22
+
+
+@vectorised
+def _couple(jacobian: Array, free: Array, degree: int, slot: int, coupling: Array, curvature: Array) -> None:
+    """Rows of the elimination: products of an edge's rows with its derivative by inverse depth."""
+    du, dv = jacobian[_BY_DEPTH : _BY_DEPTH + TILE], jacobian[_BY_DEPTH + TILE : _BY_DEPTH + 2 * TILE]
+    for r in range(6):
+        u, v = jacobian[2 * r * TILE : (2 * r + 1) * TILE], jacobian[(2 * r + 1) * TILE : (2 * r + 2) * TILE]
+        out = coupling[(6 * slot + r) * TILE : (6 * slot + r + 1) * TILE]
+        for p in range(TILE):
+            out[p] = u[p] * du[p] + v[p] * dv[p]
+    for r in range(TAIL):
+        if r == 2 or free[r]:
+            u = jacobian[(12 + 2 * r) * TILE : (13 + 2 * r) * TILE]
+            v = jacobian[(13 + 2 * r) * TILE : (14 + 2 * r) * TILE]
+            out = coupling[(6 * degree + r) * TILE : (6 * degree + r + 1) * TILE]
+            for p in range(TILE):
+                out[p] += u[p] * du[p] + v[p] * dv[p]
+    for p in range(TILE):
+        curvature[p] += du[p] * du[p] + dv[p] * dv[p]
+
+
+@vectorised
+def _prior_pull(prior: DepthPrior, depth: Array, frame: int, start: int, n: int, pull: Array, weight: Array) -> Any:
+    """Information and information times (prior - state) of a tile; returns the cost."""
+    zero = pull.dtype.type(0)
+    total = zero
+    for p in range(TILE):
+        pull[p] = zero
+        weight[p] = zero
+    if len(prior.weight):
+        value, information, current = prior.value[frame][start:], prior.weight[frame][start:], depth[frame][start:]
+        for p in range(n):
+            off = value[p] - current[p]
+            off = off if information[p] > zero else zero
+            weight[p] = information[p]
+            pull[p] = information[p] * off
+            total += information[p] * off * off
+    return total
+
+
+@vectorised
+def evaluate(
+    graph: Graph, pose: Pose, prior: DepthPrior, kernel: int, scale: Array, begin: int, end: int, sums: Array
+) -> None:
+    """Robust cost of the frames begin:end.
+
+    Args:
+        kernel: One of `ROBUST_CODE`.
+        scale: (1,) squared scale of the kernel, px^2.
+        sums: (N, 4) float64 zeros, filled with wmax rho(s), wmax of what is imaged, all wmax, and the prior's cost.
+    """
+    cells = pose.rays.shape[1]
+    view, pull, weight = (
+        np.empty(_VIEW_SIZE, pose.rays.dtype),
+        np.empty(TILE, pose.rays.dtype),
+        np.empty(TILE, pose.rays.dtype),
+    )
+    for frame in range(begin, end):
+        for start in range(0, cells, TILE):
+            n = min(TILE, cells - start)
+            for order in range(graph.first[frame], graph.first[frame + 1]):
+                sums[frame, 2] += _see(graph, pose, frame, order, start, n, view)
+                cost, kept = _rho_sum(kernel, scale[0], view, n)
+                sums[frame, 0] += cost
+                sums[frame, 1] += kept
+            if graph.depth_free[frame]:
+                sums[frame, 3] += _prior_pull(prior, pose.inverse_depth, frame, start, n, pull, weight)
+
+
+@vectorised
+def linearise(
+    graph: Graph,
+    pose: Pose,
+    prior: DepthPrior,
+    kernel: int,
+    scale: Array,
+    free: Array,
+    begin: int,
+    end: int,
+    sums: Array,
+    direct: Array,
+    offset: Array,
+    eliminated: Array,
+) -> None:
+    """Cost and normal equations, in the twists of the edges, of the frames begin:end.
+
+    Args:
+        free: (2,) bool, whether log f and alpha move.
+        sums: As in `evaluate`.
+        direct: (E 81,) float64 zeros, filled with the 9x9 J^T J of every edge in order; only the lower 3x3 blocks.
+        offset: (N + 1,) where the frames begin in `eliminated`.
+        eliminated: Flat float64 zeros: per frame with D edges and free depths, (6 D + 3)^2 numbers that eliminating
+            the undamped depths subtracts; rows are the twists of the edges, log f, alpha, right-hand side.
+    """
+    cells, dtype = pose.rays.shape[1], pose.rays.dtype
+    most = 0
+    for frame in range(begin, end):
+        most = max(most, graph.first[frame + 1] - graph.first[frame])
+    view, jacobian = np.zeros(_VIEW_SIZE, dtype), np.zeros(_JACOBIAN_SIZE, dtype)
+    coupling = np.zeros((6 * most + TAIL) * TILE, dtype)
+    curvature, pull = np.zeros(TILE, dtype), np.zeros(TILE, dtype)
+    zero, one, tiny = dtype.type(0), dtype.type(1), dtype.type(1.2e-38)
+    for frame in range(begin, end):
+        first, last = graph.first[frame], graph.first[frame + 1]
+        degree = last - first
+        size = 6 * degree + TAIL
+        depth_free = graph.depth_free[frame]
+        for start in range(0, cells, TILE):
+            n = min(TILE, cells - start)
+            if depth_free:
+                sums[frame, 3] += _prior_pull(prior, pose.inverse_depth, frame, start, n, pull, curvature)
+                for p in range(TILE):
+                    coupling[6 * degree * TILE + p] = zero
+                    coupling[(6 * degree + 1) * TILE + p] = zero
+                    coupling[(6 * degree + 2) * TILE + p] = pull[p]
+            for order in range(first, last):
+                sums[frame, 2] += _see(graph, pose, frame, order, start, n, view)
+                cost, kept = _rho_sum(kernel, scale[0], view, n)
+                sums[frame, 0] += cost
+                sums[frame, 1] += kept
+                _reweigh(kernel, scale[0], view, n)
+                _differentiate(pose, frame, order, start, n, free, view, jacobian)
+                _gram(jacobian, 3, 2 * TILE, direct, ROWS * ROWS * order)
+                if depth_free:
+                    _couple(jacobian, free, degree, order - first, coupling, curvature)
+            if depth_free and degree:
+                for p in range(TILE):
+                    c = curvature[p]
+                    curvature[p] = one / math.sqrt(c) if c > tiny else zero
+                for r in range(size):
+                    out = coupling[r * TILE : (r + 1) * TILE]
+                    for p in range(TILE):
+                        out[p] *= curvature[p]
+                _gram(coupling, 2 * degree + 1, TILE, eliminated, offset[frame])
+
+
+@vectorised
+def _follow(
+    pose: Pose, twist: Array, order: int, frame: int, start: int, n: int, view: Array, change: Array, sums: Array
+) -> None:
+    """Add an edge's part in the step of the depths: sums rows are curvature, right-hand side, and what is left of it.
+
+    Args:
+        twist: (8,) step of the edge's twist, log f and alpha.
+        change: Scratch for three rows.
+    """
+    row = pose.transform[order]
+    depth = pose.inverse_depth[frame][start:]
+    fx, fy, alpha = pose.camera[0], pose.camera[1], pose.camera[4]
+    t0, t1, t2 = row[3], row[7], row[11]
+    a0, a1, a2, b0, b1, b2, df, da = twist[0], twist[1], twist[2], twist[3], twist[4], twist[5], twist[6], twist[7]
+    zero, one = view.dtype.type(0), view.dtype.type(1)
+    for p in range(3 * TILE):
+        change[p] = zero
+    for k in range(2):
+        if twist[6 + k] != 0:
+            rays = pose.rays_by_intrinsics[k]
+            rx, ry, rz = rays[0][start:], rays[1][start:], rays[2][start:]
+            step = twist[6 + k]
+            for p in range(n):
+                a, b, c = rx[p] * step, ry[p] * step, rz[p] * step
+                change[p] += row[0] * a + row[1] * b + row[2] * c
+                change[TILE + p] += row[4] * a + row[5] * b + row[6] * c
+                change[2 * TILE + p] += row[8] * a + row[9] * b + row[10] * c
+    for p in range(n):
+        su, sv, inverse = view[_SU + p], view[_SV + p], view[_INV + p]
+        x, y, z, px, py, d = view[_X + p], view[_Y + p], view[_Z + p], view[_PX + p], view[_PY + p], depth[p]
+        norm = view[_NORM + p]
+        bend = alpha / norm
+        hx, hy, hz = bend * x, bend * y, one + bend * z
+        gu, gv = su * fx * inverse, sv * fy * inverse
+        slope = hx * t0 + hy * t1 + hz * t2
+        ju, jv = gu * (t0 - px * slope), gv * (t1 - py * slope)
+        m0 = a0 * d + b1 * z - b2 * y + change[p]
+        m1 = a1 * d + b2 * x - b0 * z + change[TILE + p]
+        m2 = a2 * d + b0 * y - b1 * x + change[2 * TILE + p]
+        slope = hx * m0 + hy * m1 + hz * m2
+        share = df - da * norm * inverse
+        eu, ev = view[_EU + p], view[_EV + p]
+        mu = gu * (m0 - px * slope) + su * fx * px * share
+        mv = gv * (m1 - py * slope) + sv * fy * py * share
+        sums[p] += ju * ju + jv * jv
+        sums[TILE + p] -= ju * eu + jv * ev
+        sums[2 * TILE + p] -= ju * (eu + mu) + jv * (ev + mv)
+
+
+@vectorised
+def back_substitute(
+    graph: Graph,
+    pose: Pose,
+    prior: DepthPrior,
+    kernel: int,
+    scale: Array,
+    twist: Array,
+    damping: Array,
+    begin: int,
+    end: int,
+    step: Array,
+    gain: Array,
+) -> None:
+    """The step of the free inverse depths of the frames begin:end, given that of everything else.
+
+    Args:
+        twist: (E, 8) step of the twists of the edges in order, each with the steps of log f and alpha.
+        damping: (1,) Levenberg-Marquardt damping.
+        step: (N, P) filled where depths are free.
+        gain: (N,) float64, filled with gradient times step.
+    """
+    cells, dtype = pose.rays.shape[1], pose.rays.dtype
+    view, change, sums = np.zeros(_VIEW_SIZE, dtype), np.zeros(3 * TILE, dtype), np.zeros(3 * TILE, dtype)
+    zero, one, tiny = dtype.type(0), dtype.type(1), dtype.type(1.2e-38)
+    for frame in range(begin, end):
+        first, last = graph.first[frame], graph.first[frame + 1]
+        gain[frame] = 0
+        if not graph.depth_free[frame] or first == last:
+            continue
+        for start in range(0, cells, TILE):
+            n = min(TILE, cells - start)
+            _prior_pull(prior, pose.inverse_depth, frame, start, n, sums[TILE : 2 * TILE], sums[:TILE])
+            for p in range(TILE):
+                sums[2 * TILE + p] = sums[TILE + p]
+            for order in range(first, last):
+                _see(graph, pose, frame, order, start, n, view)
+                _reweigh(kernel, scale[0], view, n)
+                _follow(pose, twist[order], order, frame, start, n, view, change, sums)
+            out = step[frame][start : start + n]
+            total = zero
+            for p in range(n):
+                c = sums[p]
+                q = one / (c * (one + damping[0])) if c > tiny else zero
+                out[p] = sums[2 * TILE + p] * q
+                total += sums[TILE + p] * out[p]
+            gain[frame] += total

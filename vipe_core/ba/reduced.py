@@ -1,0 +1,161 @@
+"""From the twists of edges to the poses of frames: assembly and damping of the sparse reduced system.
+
+With tau = delta_j - Ad(T) delta_i of edge i -> j, a quadratic form in the twists becomes one in the poses by products
+with -Ad(T) on the side of the source. Poses are named by their column in the structure (`block_cholesky.py`); -1 is a
+fixed one, whose blocks are dropped. Only blocks on and below the diagonal are stored. All float64.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vipe_core.ba.solver import MIN_CURVATURE
+from vipe_core.compilation import vectorised
+
+Array = NDArray[Any]
+
+
+@vectorised
+def _slot(first: Array, rows: Array, row: int, column: int) -> int:
+    """Index of block (row, column), row >= column, which must be part of the structure."""
+    low, high = first[column], first[column + 1] - 1
+    while low < high:
+        middle = (low + high) // 2
+        if rows[middle] < row:
+            low = middle + 1
+        else:
+            high = middle
+    return int(low)
+
+
+@vectorised
+def _add(first: Array, rows: Array, i: int, j: int, local: Array, a0: int, b0: int, height: int, blocks: Array) -> None:
+    """Add local[a0 : a0 + height, b0 : b0 + 6] to the block of row i and column j, or its transpose to (j, i)."""
+    if i < 0 or j < 0:
+        return
+    if i >= j:
+        block = blocks[_slot(first, rows, i, j)]
+        for a in range(height):
+            for b in range(6):
+                block[a, b] += local[a0 + a, b0 + b]
+    else:
+        block = blocks[_slot(first, rows, j, i)]
+        for a in range(height):
+            for b in range(6):
+                block[b, a] += local[a0 + a, b0 + b]
+
+
+@vectorised
+def add_twists(
+    first: Array,
+    rows: Array,
+    group: Array,
+    source: Array,
+    target: Array,
+    shared: int,
+    adjoint: Array,
+    offset: Array,
+    matrices: Array,
+    blocks: Array,
+    gradient: Array,
+) -> None:
+    """Add quadratic forms in the twists of groups of edges with a common source.
+
+    Args:
+        first, rows: The structure.
+        group: (G + 1,) where the groups begin among the edges.
+        source, target: (E,) columns of the poses.
+        shared: Column of the intrinsics or -1.
+        adjoint: (E, 6, 6).
+        offset: (G + 1,) where the groups begin in `matrices`.
+        matrices: Flat; per group of D edges nothing, or (6 D + 3)^2 numbers whose lower 3x3 blocks hold the rows of
+            the D twists, log f, alpha, right-hand side.
+        blocks: (B, 6, 6), added to.
+        gradient: (nodes, 6), added to.
+    """
+    most = 0
+    for g in range(len(group) - 1):
+        most = max(most, group[g + 1] - group[g])
+    # Rows of the source, of the twists, of the tail.
+    local = np.empty((6 * most + 9, 6 * most + 9))
+    for g in range(len(group) - 1):
+        begin, degree, base = group[g], group[g + 1] - group[g], offset[g]
+        if base == offset[g + 1] or degree == 0:
+            continue
+        size = 6 * degree + 3
+        for a in range(size):
+            for b in range(a + 1):
+                local[6 + a, 6 + b] = matrices[base + a * size + b]
+                local[6 + b, 6 + a] = local[6 + a, 6 + b]
+        for a in range(6):
+            for b in range(size + 6):
+                local[a, b] = 0.0
+        for m in range(degree):
+            for k in range(6):
+                for a in range(6):
+                    x = adjoint[begin + m, k, a]
+                    for b in range(6, size + 6):
+                        local[a, b] -= x * local[6 + 6 * m + k, b]
+        for m in range(degree):
+            for a in range(6):
+                for k in range(6):
+                    x = local[a, 6 + 6 * m + k]
+                    for b in range(6):
+                        local[a, b] -= x * adjoint[begin + m, k, b]
+        for a in range(6):
+            for b in range(6, size + 6):
+                local[b, a] = local[a, b]
+
+        i, right = source[begin], size + 5
+        _add(first, rows, i, i, local, 0, 0, 6, blocks)
+        for m in range(degree):
+            j, at = target[begin + m], 6 + 6 * m
+            _add(first, rows, j, i, local, at, 0, 6, blocks)
+            for other in range(m + 1):
+                k = target[begin + other]
+                _add(first, rows, j, k, local, at, 6 + 6 * other, 6, blocks)
+                if j == k and m != other:
+                    _add(first, rows, j, k, local, 6 + 6 * other, at, 6, blocks)
+            if shared >= 0:
+                _add(first, rows, shared, j, local, right - 2, at, 2, blocks)
+            if j >= 0:
+                for a in range(6):
+                    gradient[j, a] += local[right, at + a]
+        if i >= 0:
+            for a in range(6):
+                gradient[i, a] += local[right, a]
+        if shared >= 0:
+            _add(first, rows, shared, i, local, right - 2, 0, 2, blocks)
+            corner = blocks[first[shared]]
+            for a in range(2):
+                gradient[shared, a] += local[right, right - 2 + a]
+                for b in range(2):
+                    corner[a, b] += local[right - 2 + a, right - 2 + b]
+
+
+@vectorised
+def damp(
+    first: Array, rows: Array, direct: Array, eliminated: Array, damping: float, factor: Array, scale: Array
+) -> None:
+    """Fill `factor` (B, 6, 6) with the damped reduced system at unit diagonal, and `scale` (nodes, 6)."""
+    shrink = 1 / (1 + damping)
+    count = len(first) - 1
+    for k in range(count):
+        p = first[k]
+        for a in range(6):
+            curvature = direct[p, a, a] - shrink * eliminated[p, a, a]
+            # Without any curvature there is no gradient either: scaled to a unit row, it does not move.
+            known = curvature > MIN_CURVATURE * direct[p, a, a]
+            scale[k, a] = 1 / math.sqrt(curvature) if known else 0.0
+    for k in range(count):
+        for p in range(first[k], first[k + 1]):
+            i = rows[p]
+            for a in range(6):
+                for b in range(6):
+                    factor[p, a, b] = (direct[p, a, b] - shrink * eliminated[p, a, b]) * scale[i, a] * scale[k, b]
+        for a in range(6):
+            factor[first[k], a, a] += damping + (0.0 if scale[k, a] > 0 else 1.0)

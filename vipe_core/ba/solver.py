@@ -1,0 +1,90 @@
+"""What the Levenberg-Marquardt loop asks of a solver, and what it gets back."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol, TypeVar
+
+from torch import Tensor
+
+from vipe_core.ba.problem import State
+
+# Largest change of log f in one step: beyond, the linearisation says nothing.
+MAX_LOG_FOCAL_STEP = 0.3
+ALPHA_RANGE = (0.0, 1.2)
+# A column whose curvature cancels to less than this share in the elimination of the depths has none.
+MIN_CURVATURE = 1e-12
+
+
+@dataclass(frozen=True, slots=True)
+class Cost:
+    """Sums over all measurements, 0-dim float64 tensors.
+
+    Attributes:
+        measurements: sum of wmax rho(s) where valid, px^2.
+        weight: sum of wmax where valid.
+        lost_weight: sum of wmax where the point is not in front of the target camera.
+        priors: Cost of the priors.
+    """
+
+    measurements: Tensor
+    weight: Tensor
+    lost_weight: Tensor
+    priors: Tensor
+
+    def total(self, lost_rho: Tensor) -> Tensor:
+        """What a step must lower. Lost measurements cost `lost_rho` each, else losing them all would be best."""
+        return self.measurements + self.priors + lost_rho * self.lost_weight
+
+
+@dataclass(frozen=True, slots=True)
+class Step:
+    """An update of the state.
+
+    Attributes:
+        pose: (N, 6) float64 left twists of cam_from_world (translation, rotation).
+        log_focal: 0-dim float64.
+        alpha: 0-dim float64.
+        inverse_depth: (N, P), before clamping.
+        predicted_drop: 0-dim float64, g^T step: how much the undamped quadratic model expects to gain.
+        factorised: 0-dim bool, whether the reduced system was positive definite; otherwise the step is not finite.
+    """
+
+    pose: Tensor
+    log_focal: Tensor
+    alpha: Tensor
+    inverse_depth: Tensor
+    predicted_drop: Tensor
+    factorised: Tensor
+
+
+System = TypeVar("System")
+
+
+class Solver(Protocol[System]):
+    """Cost, linearisation and step of one problem; holds no state of the unknowns.
+
+    A `System` is the normal equations at a state, to be solved for any damping.
+
+    Attributes:
+        anything_free: Whether there is an unknown.
+        focal_free: Whether the focal length is one.
+    """
+
+    anything_free: bool
+    focal_free: bool
+
+    def cost(self, state: State) -> Cost:
+        """The robust cost at a state."""
+
+    def linearise(self, state: State) -> System:
+        """The normal equations at a state."""
+
+    def step(self, system: System, damping: float) -> Step:
+        """Solve the damped system."""
+
+    def retract(self, state: State, step: Step) -> State:
+        """The state after a step. Whatever the step does not touch keeps its bits."""
+
+    def log_focal_variance(self, system: System, damping: float) -> Tensor:
+        """Variance of log f with everything else marginalised; NaN where the damped system is singular. 0-dim."""
