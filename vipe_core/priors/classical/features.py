@@ -18,7 +18,11 @@ STRIDE = 8
 """Working pixels per grid cell. Cell (y, x) samples index coordinates (8x + 3.5, 8y + 3.5)."""
 
 _STRUCTURE_BOX_PX = 13
+_MAX_CORNERS = 1000
+_CORNER_TERMINATION = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 20, 0.01)
 _MASK_MARGIN_PX = 4
+# What Scharr's integer kernel makes of a slope of one grey level per pixel.
+_SCHARR_GAIN = 32
 
 
 @dataclass(frozen=True)
@@ -46,10 +50,10 @@ class FlowFeatures:
     @cached_property
     def structure(self) -> NDArray[np.float32]:
         """(P, 2) squared gradient per component, (grey levels / px)^2, averaged over a box of about 12 px per cell."""
-        gx = cv2.Scharr(self.gray, cv2.CV_32F, 1, 0, scale=1 / 32)
-        gy = cv2.Scharr(self.gray, cv2.CV_32F, 0, 1, scale=1 / 32)
+        gx, gy = cv2.Scharr(self.gray, cv2.CV_16S, 1, 0), cv2.Scharr(self.gray, cv2.CV_16S, 0, 1)
         box = (_STRUCTURE_BOX_PX, _STRUCTURE_BOX_PX)
-        return np.stack([cell_mean(cv2.blur(g * g, box)).reshape(-1) for g in (gx, gy)], axis=-1)
+        squares = [cell_mean(cv2.sqrBoxFilter(g, cv2.CV_32F, box)).reshape(-1) for g in (gx, gy)]
+        return np.stack(squares, axis=-1) / np.float32(_SCHARR_GAIN**2)
 
     @cached_property
     def usable(self) -> NDArray[np.bool_] | None:
@@ -78,6 +82,16 @@ class FlowFeatures:
         if not usable.any():
             return usable
         return np.asarray(usable & (strength >= min(4.0, float(np.quantile(strength[usable], 0.7)))))
+
+    @cached_property
+    def corners_px(self) -> NDArray[np.float32]:
+        """(n, 2) index coordinates of at most 1000 corners to a fraction of a pixel, at least a cell apart."""
+        mask = None if self.usable is None else self.usable.astype(np.uint8)
+        found = cv2.goodFeaturesToTrack(self.gray, _MAX_CORNERS, 0.003, STRIDE, mask=mask, blockSize=5)
+        if found is None:
+            return np.zeros((0, 2), np.float32)
+        refined = cv2.cornerSubPix(self.gray, found, (3, 3), (-1, -1), _CORNER_TERMINATION)
+        return np.asarray(refined.reshape(-1, 2), np.float32)
 
     @cached_property
     def structure_floor(self) -> float:

@@ -19,7 +19,6 @@ class LkTracker:
     """`SparseTracker` on the features of `DisFlowMatcher`.
 
     Args:
-        max_corners: Upper bound of corners per frame; they are at least `STRIDE` pixels apart.
         window_px: Side of the Lucas-Kanade window.
         max_fb_px: Tracks that do not come back within this distance are dropped.
         max_correction_px: Tracks that leave the dense flow by more than this are dropped: there the dense flow (and so
@@ -29,13 +28,11 @@ class LkTracker:
 
     def __init__(
         self,
-        max_corners: int = 1000,
         window_px: int = 11,
         max_fb_px: float = 0.5,
         max_correction_px: float = 2.0,
         weight: float = 4.0,
     ) -> None:
-        self._max_corners = max_corners
         self._window = (window_px, window_px)
         self._max_fb_px = max_fb_px
         self._max_correction_px = max_correction_px
@@ -83,12 +80,9 @@ class LkTracker:
     ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_]]:
         """Corners (n, 2), the dense displacement there, and whether the flow around them is smooth enough to use."""
         grid = source.grid
-        mask = None if source.usable is None else source.usable.astype(np.uint8)
-        found = cv2.goodFeaturesToTrack(source.gray, self._max_corners, 0.003, STRIDE, mask=mask, blockSize=5)
-        empty = np.zeros((0, 2), np.float32)
-        if found is None:
-            return empty, empty, np.zeros(0, bool)
-        corners = cv2.cornerSubPix(source.gray, found, (3, 3), (-1, -1), _TERMINATION).reshape(-1, 2)
+        corners = source.corners_px
+        if not len(corners):
+            return corners, np.zeros((0, 2), np.float32), np.zeros(0, bool)
         field = np.ascontiguousarray(displacement, np.float32).reshape(grid.height, grid.width, 2)
         at_cells = (corners - grid.offset) / grid.stride
         flow = sample_px(field, at_cells)
