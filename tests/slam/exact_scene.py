@@ -84,7 +84,7 @@ class ExactScene:
 
     def priors(self, fov_deg: float = 60.0, sigma: float = 0.1) -> PriorFamily:
         """The scene as its own matcher, and an initial camera of the given field of view."""
-        return PriorFamily(matcher=self, tracker=None, intrinsics=_Guess(fov_deg, sigma))
+        return PriorFamily(matcher=self, tracker=None, points=None, intrinsics=_Guess(fov_deg, sigma))
 
     # -- the frame source: pictures are blank, only their number counts --------------------------------------------
 

@@ -85,6 +85,41 @@ class SparseTracker(Protocol):
 
 
 @dataclass(frozen=True, slots=True)
+class Correspondences:
+    """The same points in two frames, verified by epipolar geometry; a few may still be wrong.
+
+    Attributes:
+        source_px: (n, 2) float32.
+        target_px: (n, 2) float32.
+    """
+
+    source_px: NDArray[np.float32]
+    target_px: NDArray[np.float32]
+
+    def __len__(self) -> int:
+        return len(self.source_px)
+
+    @classmethod
+    def none(cls) -> Correspondences:
+        return cls(np.zeros((0, 2), np.float32), np.zeros((0, 2), np.float32))
+
+
+class PointMatcher(Protocol):
+    """Correspondences between frames however far apart, for where dense matching needs a starting point."""
+
+    def correspond(self, source: Any, target: Any) -> Correspondences:
+        """Correspondences between two frames; empty when there are too few to be sure of.
+
+        Args:
+            source: Features of `DenseMatcher.encode`.
+            target: Features of `DenseMatcher.encode`.
+        """
+
+    def overview(self, features: Any) -> NDArray[np.float32]:
+        """(n, D) descriptors of unit length by which places are recognised; cheaper than those of `correspond`."""
+
+
+@dataclass(frozen=True, slots=True)
 class IntrinsicsEstimate:
     """An initial camera with how far it can be trusted.
 
@@ -111,9 +146,11 @@ class PriorFamily:
     Attributes:
         matcher: Dense matching.
         tracker: Sparse tracks, or None for a family whose dense matching needs none.
+        points: Correspondences across wide steps, or None for a family whose dense matching needs none.
         intrinsics: Initial camera.
     """
 
     matcher: DenseMatcher
     tracker: SparseTracker | None
+    points: PointMatcher | None
     intrinsics: IntrinsicsInit

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from vipe_core.ba.problem import Result
 from vipe_core.slam.adjustment import REFINE, Adjuster
+from vipe_core.slam.closing import LoopCloser
 from vipe_core.slam.masks import moving_cells
 from vipe_core.slam.measuring import MeasuredGraph
 from vipe_core.slam.proximity import close_pairs, loop_edges
@@ -57,6 +58,7 @@ class Backend:
         self._reprojector = reprojector
         self._settings = settings
         self._width = working_width
+        self._closer = LoopCloser(measured, adjuster, reprojector)
         self.focal = FocalReport(adjuster.focal_prior.sigma, observed=False)
 
     def run(self) -> Result | None:
@@ -64,6 +66,8 @@ class Backend:
         if len(self._keyframes) < 2:
             return None
         self._connect_loops()
+        if self._closer.run():
+            self._connect_loops()
         self._mask_moving()
         if self._measured.graph.area_votes:
             # With large things moving, a free focal length helps them before they are masked.

@@ -67,6 +67,11 @@ class Graph:
             bisect.insort(self._targets.setdefault(source, []), target)
         self._matches[source, target] = match
 
+    def discard(self, source: int, target: int) -> None:
+        """Forget an edge."""
+        del self._matches[source, target]
+        self._targets[source].remove(target)
+
     def targets(self, source: int) -> list[int]:
         """Where the edges out of `source` lead, in order."""
         return list(self._targets.get(source, ()))

@@ -4,10 +4,18 @@ from __future__ import annotations
 
 from typing import Any
 
-from vipe_core.priors.protocols import DenseMatcher, Match, SparseTracker
+import numpy as np
+from numpy.typing import NDArray
+
+from vipe_core.priors.protocols import Correspondences, DenseMatcher, Match, PointMatcher, SparseTracker
 from vipe_core.slam.graph import Graph, fuse
+from vipe_core.slam.guessing import displacement_guess
 from vipe_core.slam.keyframes import KeyframeMap
 from vipe_core.slam.reprojection import Reprojector
+
+# A pair with less forward-backward consistency than this may have been matched from the wrong start.
+_SURE = 0.5
+_MIN_POINTS = 20
 
 
 class MeasuredGraph:
@@ -24,6 +32,7 @@ class MeasuredGraph:
         graph: Graph,
         matcher: DenseMatcher,
         sparse: SparseTracker | None,
+        points: PointMatcher | None,
         reprojector: Reprojector,
         *,
         dense_flow: bool = True,
@@ -32,11 +41,21 @@ class MeasuredGraph:
         self.graph = graph
         self._matcher = matcher
         self._sparse = sparse
+        self._points = points
         self._reprojector = reprojector
         self._dense_flow = dense_flow
 
+    def overview(self, k: int) -> NDArray[np.float32]:
+        """(n, D) descriptors by which the place of a keyframe is recognised; none without a matcher of points."""
+        if self._points is None:
+            return np.zeros((0, 1), np.float32)
+        return self._points.overview(self.keyframes.features[k])
+
     def connect(self, i: int, j: int, *, guided: bool, min_consistent: float = 0.0) -> float:
         """Measure i -> j and j -> i.
+
+        Where the match contradicts itself, the step may be too wide for its start: it is tried once more from sparse
+        correspondences, and the one that measures more is taken.
 
         Args:
             guided: Start the search where the current poses and depths of the map put it.
@@ -50,9 +69,34 @@ class MeasuredGraph:
         if guided:
             guess_px = self._reprojector.edge(self.keyframes, i, j).target_px
         there, back = self._matcher.match(source, target, guess_px)
+        if min(there.consistent, back.consistent) < _SURE:
+            points = self._correspond(i, j)
+            if len(points) >= _MIN_POINTS:
+                again = self._matcher.match(source, target, displacement_guess(points, self.keyframes.grid))
+                if _measured(*again) > _measured(there, back):
+                    there, back = again
+        return self._file(i, j, there, back, min_consistent)
+
+    def connect_by_points(self, i: int, j: int, min_consistent: float) -> float:
+        """Measure i -> j and j -> i wherever the cameras are, from sparse correspondences; 0 when there are too few."""
+        points = self._correspond(i, j)
+        if len(points) < _MIN_POINTS:
+            return 0.0
+        source, target = self.keyframes.features[i], self.keyframes.features[j]
+        there, back = self._matcher.match(source, target, displacement_guess(points, self.keyframes.grid))
+        return self._file(i, j, there, back, min_consistent)
+
+    def _correspond(self, i: int, j: int) -> Correspondences:
+        if self._points is None:
+            return Correspondences.none()
+        return self._points.correspond(self.keyframes.features[i], self.keyframes.features[j])
+
+    def _file(self, i: int, j: int, there: Match, back: Match, min_consistent: float) -> float:
+        """Add tracks to a dense match and put it into the graph, if it is consistent enough."""
         consistent = min(there.consistent, back.consistent)
         if consistent < min_consistent:
             return consistent
+        source, target = self.keyframes.features[i], self.keyframes.features[j]
         self.graph.add(i, j, self._with_tracks(source, target, there))
         self.graph.add(j, i, self._with_tracks(target, source, back))
         return consistent
@@ -62,3 +106,8 @@ class MeasuredGraph:
             return dense
         sparse = self._sparse.match(source, target, dense)
         return fuse(dense, sparse) if self._dense_flow else sparse
+
+
+def _measured(there: Match, back: Match) -> float:
+    """How much two directions measure together."""
+    return float(np.sum(there.weight, dtype=np.float64) + np.sum(back.weight, dtype=np.float64))

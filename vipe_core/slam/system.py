@@ -124,6 +124,7 @@ class Slam:
             graph,
             self._priors.matcher,
             self._priors.tracker if terms.sparse_tracks else None,
+            self._priors.points,
             reprojector,
             dense_flow=terms.dense_flow,
         )

@@ -5,16 +5,25 @@ from __future__ import annotations
 from vipe_core.priors.classical.features import FlowFeatures
 from vipe_core.priors.classical.flow import DisFlowMatcher
 from vipe_core.priors.classical.focal import FocalVote, TwoViewFocalInit
+from vipe_core.priors.classical.sift import SiftMatcher
 from vipe_core.priors.classical.tracks import LkTracker
 from vipe_core.priors.protocols import PriorFamily
 
-__all__ = ["DisFlowMatcher", "FlowFeatures", "FocalVote", "LkTracker", "TwoViewFocalInit", "classical_priors"]
+__all__ = [
+    "DisFlowMatcher",
+    "FlowFeatures",
+    "FocalVote",
+    "LkTracker",
+    "SiftMatcher",
+    "TwoViewFocalInit",
+    "classical_priors",
+]
 
 
 def classical_priors() -> PriorFamily:
-    """DIS flow, Lucas-Kanade tracks and the two-view focal vote.
+    """DIS flow, Lucas-Kanade tracks, SIFT correspondences and the two-view focal vote.
 
     Make one per thread. The number of OpenCV threads is the caller's choice.
     """
     matcher = DisFlowMatcher()
-    return PriorFamily(matcher=matcher, tracker=LkTracker(), intrinsics=TwoViewFocalInit(matcher))
+    return PriorFamily(matcher=matcher, tracker=LkTracker(), points=SiftMatcher(), intrinsics=TwoViewFocalInit(matcher))

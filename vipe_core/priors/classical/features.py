@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vipe_core.ba.problem import Grid
+from vipe_core.priors.classical.keypoints import Keypoints, detect
 
 Array = NDArray[Any]
 
@@ -100,6 +101,19 @@ class FlowFeatures:
         if not usable.any():
             return 9.0
         return float(np.clip(np.quantile(self.structure.max(axis=1)[usable], 0.6), 1.0, 9.0))
+
+    @cached_property
+    def keypoints(self) -> Keypoints:
+        """Local features of the whole picture."""
+        return detect(self.gray, self.usable)
+
+    @cached_property
+    def overview(self) -> Keypoints:
+        """Local features of the picture at half its size: coarser, and at a quarter of the price."""
+        height, width = self.half.shape
+        usable = None if self.usable is None else np.asarray(self.usable[: 2 * height : 2, : 2 * width : 2])
+        found = detect(self.half, usable)
+        return Keypoints(2 * found.points_px + np.float32(0.5), found.descriptors)
 
 
 def grid_of(gray: Array) -> Grid:
