@@ -25,7 +25,10 @@ def displacement_guess(points: Correspondences, grid: Grid) -> NDArray[np.float3
     cells = grid.sample_px().numpy().astype(np.float64)
     source = points.source_px.astype(np.float64)
     moved = points.target_px.astype(np.float64) - source
-    distance, nearest = KDTree(source).query(cells, k=min(_NEIGHBOURS, len(source)))
+    # A list of ranks keeps the second axis even for a single correspondence.
+    ranks = list(range(1, min(_NEIGHBOURS, len(source)) + 1))
+    found = KDTree(source).query(cells, k=ranks)
+    distance, nearest = np.asarray(found[0]), np.asarray(found[1])
     width = np.maximum(distance[:, [min(3, distance.shape[1] - 1)]], _FIT_WIDTH_PX)
     near = np.exp(-0.5 * np.square(distance / width))
     offset = source[nearest] - cells[:, None]

@@ -75,10 +75,10 @@ def _step(nodes: Sequence[Sim3], links: Sequence[SimLink]) -> NDArray[np.float64
         errors[7 * row : 7 * row + 7] = root * np.concatenate(
             [error.translation, Rotation.from_matrix(error.rotation).as_rotvec(), [np.log(error.scale)]]
         )
-        for node, jacobian in ((link.target, np.eye(7)), (link.source, -_adjoint(link.target_from_source))):
+        for node, slope in ((link.target, np.eye(7)), (link.source, -_adjoint(link.target_from_source))):
             rows.append(7 * row + block[0])
             columns.append(7 * node + block[1])
-            values.append(root * jacobian.reshape(-1))
+            values.append(root * slope.reshape(-1))
     size = 7 * len(nodes)
     index = np.concatenate(rows), np.concatenate(columns)
     jacobian = coo_array((np.concatenate(values), index), shape=(7 * len(links), size)).tocsc()[:, 7:]

@@ -40,7 +40,7 @@ class Keypoints:
     def vectors(self) -> NDArray[np.float32]:
         """(n, 128) descriptors of unit length."""
         vectors = self.descriptors.astype(np.float32)
-        return vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-6)
+        return np.asarray(vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-6))
 
 
 def detect(gray: NDArray[np.uint8], usable: NDArray[np.bool_] | None) -> Keypoints:
