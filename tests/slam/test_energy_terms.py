@@ -77,7 +77,7 @@ def test_what_is_filed_in_the_graph(sparse: bool, dense_flow: bool) -> None:
         keyframes.append(Keyframe(k, k), k / 30, np.eye(4), np.ones(GRID.num_cells))
     graph = Graph()
     tracks = ShiftedTracks() if sparse else None
-    measured = MeasuredGraph(keyframes, graph, scene, tracks, scene.reprojector, dense_flow=dense_flow)
+    measured = MeasuredGraph(keyframes, graph, scene, tracks, None, scene.reprojector, dense_flow=dense_flow)
     measured.connect(0, 1, guided=False)
     dense = scene.measure(0, 1)
     shift_px, seen = graph[0, 1].target_px - dense.target_px, dense.weight[:, 0] > 0
