@@ -162,6 +162,8 @@ def dense_from_cells(cells: Array, grid: Grid, shape: tuple[int, int]) -> NDArra
 
 def fill_cells(values: Array, known: Array, grid: Grid) -> NDArray[np.float32]:
     """(P, c) with unknown cells filled from known ones nearby (normalised Gaussian blur at two widths)."""
+    if known.all():
+        return np.asarray(values, np.float32)
     v = np.where(known[:, None], values, 0).astype(np.float32).reshape(grid.height, grid.width, -1)
     k = known.astype(np.float32).reshape(grid.height, grid.width)
     out = np.empty_like(v)

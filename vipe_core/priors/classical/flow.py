@@ -102,19 +102,20 @@ class DisFlowMatcher:
 
     def match(self, source: FlowFeatures, target: FlowFeatures, guess_px: Array | None = None) -> tuple[Match, Match]:
         """Measurements source -> target and target -> source; see `DenseMatcher.match`."""
-        forward_init, backward_init = _initial_flows(source, guess_px)
+        guess = _guessed_cells(source, guess_px)
+        forward_init, backward_init = _dense_guess(guess, source), _dense_inverse(guess, source)
         forward = self._refined(self._medium, source.gray, target.gray, forward_init)
         backward = self._refined(self._medium, target.gray, source.gray, backward_init)
         return _measure(source, target, forward, backward), _measure(target, source, backward, forward)
 
     def match_fast(self, source: FlowFeatures, target: FlowFeatures, guess_px: Array | None = None) -> Match:
         """One-way measurement; the backward flow of the check is the cheapest preset."""
-        forward_init, _ = _initial_flows(source, guess_px)
-        forward = self._refined(self._fast, source.gray, target.gray, forward_init)
+        init = _dense_guess(_guessed_cells(source, guess_px), source)
+        forward = self._refined(self._fast, source.gray, target.gray, init)
         # The check runs at its own cost but must not fail for wide motion: it starts from the inverse of the answer.
-        inverse = _inverse_cells(cell_mean(forward).reshape(-1, 2), source.grid)
-        init = dense_from_cells(inverse, source.grid, source.gray.shape)
-        backward = self._ultrafast.calc(target.gray, source.gray, init)
+        backward = self._ultrafast.calc(
+            target.gray, source.gray, _dense_inverse(cell_mean(forward).reshape(-1, 2), source)
+        )
         return _measure(source, target, forward, backward)
 
     def _refined(self, dis: _Flow, source: Array, target: Array, init: Array | None) -> NDArray[np.float32]:
@@ -133,23 +134,29 @@ class DisFlowMatcher:
         return dis.calc(source, target, np.array(init, np.float32, order="C"))
 
 
-def _initial_flows(
-    source: FlowFeatures, guess_px: Array | None
-) -> tuple[NDArray[np.float32] | None, NDArray[np.float32] | None]:
-    """Dense starting flows in both directions from the guess at the source cells; None without a usable guess."""
+def _guessed_cells(source: FlowFeatures, guess_px: Array | None) -> NDArray[np.float32] | None:
+    """(P, 2) displacement of every cell from the guess at those that have one; None without a usable guess."""
     if guess_px is None:
-        return None, None
+        return None
     height, width = source.gray.shape
     displacement = np.asarray(guess_px, np.float64) - cell_centres_px(source.grid)
     # Points that the current geometry puts behind the camera come in as anything at all.
     with np.errstate(invalid="ignore"):
         known = np.isfinite(displacement).all(axis=1) & (np.abs(displacement).max(axis=1) < width + height)
     if not known.any():
-        return None, None
-    cells = fill_cells(np.where(known[:, None], displacement, 0), known, source.grid)
-    backward = _inverse_cells(cells, source.grid)
-    shape = (height, width)
-    return dense_from_cells(cells, source.grid, shape), dense_from_cells(backward, source.grid, shape)
+        return None
+    return fill_cells(np.where(known[:, None], displacement, 0), known, source.grid)
+
+
+def _dense_guess(cells: Array | None, source: FlowFeatures) -> NDArray[np.float32] | None:
+    """Dense starting flow out of displacements of the source's cells."""
+    height, width = source.gray.shape
+    return None if cells is None else dense_from_cells(cells, source.grid, (height, width))
+
+
+def _dense_inverse(cells: Array | None, source: FlowFeatures) -> NDArray[np.float32] | None:
+    """Dense starting flow of the way back."""
+    return None if cells is None else _dense_guess(_inverse_cells(cells, source.grid), source)
 
 
 def _inverse_cells(displacement: Array, grid: Grid) -> NDArray[np.float32]:
