@@ -29,6 +29,15 @@ class Quality:
         parallax_deg: Median over keyframes of the angle under which their points are seen.
         focal_sigma_ratio: 1-sigma of the focal length divided by the focal length (inflated to be honest).
         frame_inlier_ratio: (N,) float32 per-frame inlier ratio of the pose fit.
+        frame_residual_px: (N,) float32 per-frame `residual_px`; NaN where nothing was measured.
+        frame_coverage: (N,) float32 share of the cells of each frame that its pose explains.
+        frame_interpolated: (N,) bool, True on frames whose pose nothing measures: it is interpolated.
+        cuts: Frames at which another shot starts. Each shot is right by itself; the step over a cut is not measured.
+        loop_edges: Links between keyframes far apart in time.
+        loop_residual_before_px: Median residual of those links before the last global adjustment, source pixels; NaN
+            without any.
+        loop_residual_after_px: The same after it.
+        loop_moved_ratio: RMS shift of the keyframes by that adjustment, as a share of the path's length.
     """
 
     reliable: Reliability
@@ -39,6 +48,14 @@ class Quality:
     parallax_deg: float
     focal_sigma_ratio: float
     frame_inlier_ratio: NDArray[np.float32]
+    frame_residual_px: NDArray[np.float32] = field(default_factory=lambda: np.zeros(0, np.float32))
+    frame_coverage: NDArray[np.float32] = field(default_factory=lambda: np.zeros(0, np.float32))
+    frame_interpolated: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, np.bool_))
+    cuts: tuple[int, ...] = ()
+    loop_edges: int = 0
+    loop_residual_before_px: float = float("nan")
+    loop_residual_after_px: float = float("nan")
+    loop_moved_ratio: float = 0.0
 
     def summary(self) -> dict[str, object]:
         """The scalar fields, JSON-ready (no NaN: missing is None)."""
@@ -54,6 +71,25 @@ class Quality:
             "coverage": number(self.coverage),
             "parallax_deg": number(self.parallax_deg),
             "focal_sigma_ratio": number(self.focal_sigma_ratio),
+            "num_interpolated": int(self.frame_interpolated.sum()),
+            "cuts": list(self.cuts),
+            "loop_edges": self.loop_edges,
+            "loop_residual_before_px": number(self.loop_residual_before_px),
+            "loop_residual_after_px": number(self.loop_residual_after_px),
+            "loop_moved_ratio": number(self.loop_moved_ratio),
+        }
+
+    def per_frame(self) -> dict[str, list[float | None] | list[int]]:
+        """The per-frame fields, JSON-ready and short: rounded numbers (None is NaN) and the interpolated frames."""
+
+        def numbers(values: NDArray[np.float32], digits: int) -> list[float | None]:
+            return [round(float(x), digits) if np.isfinite(x) else None for x in values]
+
+        return {
+            "frame_inlier_ratio": numbers(self.frame_inlier_ratio, 3),
+            "frame_residual_px": numbers(self.frame_residual_px, 3),
+            "frame_coverage": numbers(self.frame_coverage, 3),
+            "interpolated_frames": [int(index) for index in np.flatnonzero(self.frame_interpolated)],
         }
 
 

@@ -11,7 +11,8 @@ from vipe_core.annotation import Quality
 from vipe_core.cameras import Camera
 from vipe_core.quality import assess
 from vipe_core.slam.backend import FocalReport
-from vipe_core.slam.diagnostics import MapReport
+from vipe_core.slam.diagnostics import LoopReport, MapReport
+from vipe_core.slam.infill import Trajectory
 from vipe_core.slam.settings import SlamSettings
 from vipe_core.slam.system import SlamResult
 from vipe_core.slam.working import WorkingSize
@@ -22,18 +23,34 @@ _CELLS = _WORKING.grid.num_cells
 
 
 def good_map(**changes: float) -> MapReport:
-    confidence = np.ones((_KEYFRAMES, _CELLS), dtype=np.float32)
+    each = np.ones(_KEYFRAMES, dtype=np.float32)
     report = MapReport(
-        residual_px=0.1, inlier_ratio=0.99, coverage=0.9, weakest_link=0.6, parallax_deg=4.0, confidence=confidence
+        residual_px=0.1,
+        inlier_ratio=0.99,
+        coverage=0.9,
+        weakest_link=0.6,
+        parallax_deg=4.0,
+        confidence=np.ones((_KEYFRAMES, _CELLS), dtype=np.float32),
+        keyframe_residual_px=0.1 * each,
+        keyframe_inlier_ratio=each,
+        keyframe_coverage=each,
     )
     return replace(report, **changes)  # type: ignore[arg-type]
+
+
+def posed(interpolated: int = 0) -> Trajectory:
+    """The first frames are interpolated."""
+    ratio = np.ones(_FRAMES, dtype=np.float32)
+    ratio[:interpolated] = 0
+    return Trajectory(np.tile(np.eye(4), (_FRAMES, 1, 1)), 0.1 * ratio, ratio, ratio, ratio == 0)
 
 
 def good(**changes: object) -> SlamResult:
     result = SlamResult(
         world_from_cam=np.tile(np.eye(4), (_FRAMES, 1, 1)),
-        frame_inlier_ratio=np.ones(_FRAMES, dtype=np.float32),
+        trajectory=posed(),
         timestamps_s=np.arange(_FRAMES) / 30.0,
+        cuts=(),
         keyframes=np.arange(_KEYFRAMES, dtype=np.int64) * 4,
         inverse_depth=np.ones((_KEYFRAMES, _CELLS), dtype=np.float32),
         static=np.ones((_KEYFRAMES, _CELLS), dtype=np.bool_),
@@ -42,6 +59,7 @@ def good(**changes: object) -> SlamResult:
         motion="general",
         focal=FocalReport(0.01, observed=True),
         map=good_map(),
+        loops=LoopReport(3, 2.0, 0.5, 0.01),
         timings_s={},
     )
     return replace(result, **changes)  # type: ignore[arg-type]
@@ -72,7 +90,9 @@ def test_a_good_result_is_reliable_and_its_residual_is_in_source_pixels() -> Non
         (good(focal=FocalReport(0.2, observed=False)), "focal_unobservable", "doubtful"),
         (good(keyframes=np.arange(3, dtype=np.int64)), "few_keyframes", "doubtful"),
         (good(timestamps_s=np.arange(4) / 30.0), "few_frames", "doubtful"),
-        (good(frame_inlier_ratio=np.zeros(_FRAMES, dtype=np.float32)), "interpolated_frames", "doubtful"),
+        (good(trajectory=posed(4)), "interpolated_frames", "doubtful"),
+        (good(trajectory=posed(_FRAMES - 4)), "interpolated_frames", "no"),
+        (good(cuts=(20,)), "shot_cut", "doubtful"),
     ],
 )
 def test_each_defect_is_named(result: SlamResult, reason: str, reliable: str) -> None:
@@ -85,3 +105,13 @@ def test_the_summary_is_json_ready() -> None:
     summary = verdict(good(map=good_map(residual_px=float("nan")))).summary()
     assert summary["residual_px"] is None
     assert summary["reasons"] == ["high_residual"]
+
+
+def test_what_is_known_of_each_frame_is_handed_on_in_source_pixels() -> None:
+    quality = verdict(good(trajectory=posed(1)))
+    frames = quality.per_frame()
+    assert frames["interpolated_frames"] == [0]
+    assert frames["frame_inlier_ratio"] == [0.0] + [1.0] * (_FRAMES - 1)
+    assert frames["frame_residual_px"] == [0.0] + [0.2] * (_FRAMES - 1)
+    summary = quality.summary()
+    assert (summary["num_interpolated"], summary["loop_edges"], summary["loop_residual_before_px"]) == (1, 3, 4.0)

@@ -16,6 +16,7 @@ from vipe_core.ba.problem import Grid
 from vipe_core.cameras import Camera
 from vipe_core.errors import EmptyMedia
 from vipe_core.priors.protocols import Match, WorkingFrame
+from vipe_core.slam.frames import EncodedFrames
 from vipe_core.slam.graph import Graph, fuse
 from vipe_core.slam.keyframes import KeyframeMap
 from vipe_core.slam.proximity import Pair, loop_edges
@@ -24,6 +25,8 @@ from vipe_core.slam.settings import SlamSettings
 from vipe_core.slam.smoothness import smooth_inverse_depth
 from vipe_core.slam.working import working_size
 from vipe_core.video.source import Frame, VideoInfo
+
+SIZE = working_size(640, 480, 640 * 480)
 
 
 def match(target: Sequence[Sequence[float]], weight: Sequence[Sequence[float]]) -> Match:
@@ -108,12 +111,13 @@ def test_unmeasured_cells_take_their_neighbours_depth() -> None:
 class Ruler:
     """A video on a line: frame k shows position `positions[k]`, and the motion between frames is their distance.
 
-    NaN is a blank frame. `open` counts the streams that nobody has closed.
+    NaN is a blank frame. `opened` counts the streams, `open` those that nobody has closed.
     """
 
     def __init__(self, positions: Sequence[float]) -> None:
         self._positions = list(positions)
         self.open = 0
+        self.opened = 0
 
     @property
     def info(self) -> VideoInfo:
@@ -124,6 +128,7 @@ class Ruler:
     ) -> Generator[Frame, None, None]:
         picture: NDArray[np.uint8] = np.zeros((8, 8, 3), dtype=np.uint8)
         self.open += 1
+        self.opened += 1
         try:
             for index in range(len(self._positions))[start:stop]:
                 yield Frame(index, index * 0.1, picture)
@@ -148,13 +153,17 @@ class Ruler:
 
 
 def select(positions: Sequence[float], **settings: object) -> Selection:
-    ruler = Ruler(positions)
     chosen = SlamSettings(**settings)  # type: ignore[arg-type]
-    return select_keyframes(ruler, working_size(640, 480, 640 * 480), ruler, chosen, lambda *_: None)
+    return select_keyframes(encoded(Ruler(positions)), SIZE, chosen, lambda *_: None)
+
+
+def encoded(ruler: Ruler, cache_bytes: int = 1 << 30) -> EncodedFrames:
+    return EncodedFrames(ruler, SIZE, ruler, cache_bytes)
 
 
 def indices(selection: Selection) -> list[int]:
-    return [keyframe.index for keyframe in selection.keyframes]
+    (shot,) = selection.shots
+    return [keyframe.index for keyframe in shot.keyframes]
 
 
 def test_a_keyframe_for_every_threshold_of_motion_and_the_last_frame() -> None:
@@ -175,7 +184,7 @@ def test_a_jump_makes_the_frame_before_it_a_keyframe() -> None:
 
 def test_a_camera_that_stands_still_has_one_keyframe() -> None:
     selection = select([0.1 * (k % 3) for k in range(50)])
-    assert selection.max_motion_px < 1.0
+    assert selection.shots[0].max_motion_px < 1.0
     assert indices(selection)[0] == 0
 
 
@@ -199,18 +208,20 @@ def test_blank_frames_are_passed_over() -> None:
     assert indices(selection)[:3] == [5, 8, 11]
     assert not {15, 16} & set(indices(selection))
     assert indices(selection)[-1] == 36
-    assert selection.max_motion_px >= 24
+    assert selection.shots[0].max_motion_px >= 24
+    np.testing.assert_array_equal(np.flatnonzero(~selection.placed), [0, 1, 2, 3, 4, 15, 16, 37, 38, 39])
 
 
 def test_a_video_of_blank_frames_keeps_its_first() -> None:
     selection = select([math.nan] * 9)
     assert indices(selection) == [0]
-    assert selection.max_motion_px == 0
+    assert selection.shots[0].max_motion_px == 0
+    assert not selection.placed.any()
 
 
 @pytest.mark.parametrize("passes", [1, 2])
 def test_a_cancelled_selection_closes_the_video_while_the_error_is_still_held(passes: int) -> None:
-    # Slow, and longer than the sample: the second pass, at a lower threshold, decodes again.
+    # Slow, and not kept: the second pass, at a lower threshold, decodes again.
     ruler = Ruler([1.5 * k for k in range(40)])
     calls = 0
 
@@ -221,9 +232,19 @@ def test_a_cancelled_selection_closes_the_video_while_the_error_is_still_held(pa
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt) as caught:
-        select_keyframes(ruler, working_size(640, 480, 640 * 480), ruler, SlamSettings(sample_frames=8), report)
+        select_keyframes(encoded(ruler, cache_bytes=0), SIZE, SlamSettings(), report)
     assert caught.value.__traceback__ is not None
     assert ruler.open == 0
+
+
+@pytest.mark.parametrize(("cache_frames", "decodings"), [(40, 1), (39, 3)])
+def test_a_clip_that_fits_in_the_cache_is_decoded_once(cache_frames: int, decodings: int) -> None:
+    ruler = Ruler([10.0 * k for k in range(40)])
+    frames = encoded(ruler, cache_bytes=round(cache_frames * 1.5 * SIZE.width * SIZE.height))
+    assert [index for _, index in frames.first_pass()] == [10.0 * k for k in range(40)]
+    assert list(frames.again()) == [(k, 10.0 * k) for k in range(40)]
+    assert list(frames.again(3, 5)) == [(3, 30.0), (4, 40.0)]
+    assert ruler.opened == decodings
 
 
 # -- working size --------------------------------------------------------------------------------------------------

@@ -54,7 +54,7 @@ def test_every_frame_is_posed_and_the_world_is_the_first_camera() -> None:
     np.testing.assert_allclose(result.world_from_cam[0], np.eye(4), atol=1e-12)
     rotation = result.world_from_cam[:, :3, :3]
     np.testing.assert_allclose(rotation @ rotation.transpose(0, 2, 1), np.tile(np.eye(3), (17, 1, 1)), atol=1e-9)
-    assert (result.frame_inlier_ratio > 0.9).all()
+    assert (result.trajectory.inlier_ratio > 0.9).all()
     assert result.keyframes[0] == 0
     assert (np.diff(result.keyframes) > 0).all()
 

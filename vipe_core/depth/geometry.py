@@ -97,8 +97,9 @@ class KeyframePrior:
         value = np.zeros(height * width)
         trust = np.zeros(height * width)
         after = int(np.searchsorted(scene.keyframes, frame, side="right"))
+        start, stop = scene.shot_of(frame)
         for k in (after - 1, after):
-            if not 0 <= k < len(scene.keyframes):
+            if not (0 <= k < len(scene.keyframes) and start <= scene.keyframes[k] < stop):
                 continue
             d, c, cell = self._carried(k, frame)
             carried, carried_trust = np.zeros_like(value), np.zeros_like(trust)
@@ -159,8 +160,9 @@ def choose_sources(scene: SceneMap, view: View, prior: Prior, frame: int, settin
     Parallax is counted in pixels rather than as a share of the depth, so that forward motion, which moves the picture
     little, gets the longer baselines that it needs. Empty when no frame of the window has parallax.
     """
-    first = max(0, frame - settings.window_frames)
-    last = min(len(scene.world_from_cam) - 1, frame + settings.window_frames)
+    start, stop = scene.shot_of(frame)
+    first = max(start, frame - settings.window_frames)
+    last = min(stop - 1, frame + settings.window_frames)
     candidates = np.array([j for j in range(first, last + 1) if j != frame], np.int64)
     if not len(candidates):
         return []

@@ -97,8 +97,9 @@ class DenseDepth:
             value = raw.inverse_depth
             votes, ratios = np.zeros_like(gray), np.zeros_like(gray)
             asked = 0
+            start, stop = scene.shot_of(index)
             for j in (index + s * d for d in settings.check_frames for s in (-1, 1)):
-                other = raws.get(j)
+                other = raws.get(j) if start <= j < stop else None
                 if other is None or not other.measured:
                     continue
                 asked += 1

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import bisect
 from dataclasses import dataclass
 
 import numpy as np
@@ -62,6 +63,7 @@ class SceneMap:
         keyframes: (K,) int64 increasing frame indices.
         inverse_depth: (K, h/8, w/8) float32 along the rays of the camera model, sampled at the centres of 8 x 8 blocks.
         confidence: (K, h/8, w/8) float32 in 0..1; 0 where nothing was measured or where something moves.
+        cuts: First frames of the shots but the first. Frames of different shots say nothing about each other.
     """
 
     camera: Camera
@@ -69,6 +71,7 @@ class SceneMap:
     keyframes: NDArray[np.int64]
     inverse_depth: NDArray[np.float32]
     confidence: NDArray[np.float32]
+    cuts: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
         cells = (len(self.keyframes), self.camera.height // 8, self.camera.width // 8)
@@ -78,6 +81,12 @@ class SceneMap:
             )
         if self.camera.width % 8 or self.camera.height % 8:
             raise ValueError(f"the working size must be whole cells, got {self.camera.width} x {self.camera.height}")
+
+    def shot_of(self, frame: int) -> tuple[int, int]:
+        """First frame of the shot that `frame` is in, and one past its last."""
+        number = bisect.bisect_right(self.cuts, frame)
+        start = self.cuts[number - 1] if number else 0
+        return start, self.cuts[number] if number < len(self.cuts) else len(self.world_from_cam)
 
 
 @dataclass(frozen=True, slots=True)

@@ -213,7 +213,7 @@ def _info_json(annotation: Annotation, attributes: Sequence[Attribute]) -> str:
         "depth_kind": DISK_DEPTH_KINDS[camera.model],
         "trajectory_length": annotation.trajectory_length,
         "quality": annotation.quality.summary(),
-        "frame_inlier_ratio": [round(float(value), 4) for value in annotation.quality.frame_inlier_ratio],
+        **annotation.quality.per_frame(),
         "provenance": asdict(annotation.provenance),
         "keyframes": [int(index) for index in annotation.keyframes],
         "timestamps_s": [float(value) for value in annotation.timestamps_s],

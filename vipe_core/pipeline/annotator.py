@@ -186,6 +186,7 @@ def _scene(result: SlamResult) -> SceneMap:
         keyframes=result.keyframes,
         inverse_depth=result.inverse_depth.reshape(shape),
         confidence=np.where(result.static, result.map.confidence, np.float32(0)).reshape(shape),
+        cuts=result.cuts,
     )
 
 

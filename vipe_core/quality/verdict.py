@@ -11,11 +11,14 @@ Reason codes are stable: they are stored with every video.
     focal_unobservable  the focal length is the initial guess, or no better than one
     high_residual       the measurements that fit, fit badly
     low_inliers         much of the picture contradicts the camera motion (moving objects, or a wrong solution)
-    weak_link           two parts of the clip hang together by almost nothing: a cut, a blur, a jump
-    interpolated_frames frames whose own pose fit failed
+    weak_link           two parts of a shot hang together by almost nothing: a blur, a jump
+    shot_cut            the video has cuts: shots are right by themselves, what lies between them is not measured
+    interpolated_frames frames whose own pose fit failed, or that show nothing
 """
 
 from __future__ import annotations
+
+import numpy as np
 
 from vipe_core.annotation import Quality, Reliability
 from vipe_core.slam.settings import SlamSettings
@@ -30,8 +33,8 @@ _MATCHING_NOISE_PX = 0.3
 _LOW_INLIERS = 0.9
 _VERY_LOW_INLIERS = 0.6
 _WEAK_LINK = 0.08
-_POSED_INLIERS = 0.1
 _MAX_INTERPOLATED = 0.02
+_MOSTLY_INTERPOLATED = 0.5
 
 
 def assess(result: SlamResult, settings: SlamSettings, source_width: int) -> Quality:
@@ -66,18 +69,31 @@ def assess(result: SlamResult, settings: SlamSettings, source_width: int) -> Qua
         if found.weakest_link < _WEAK_LINK:
             reasons.append("weak_link")
             fatal = True
-        if float((result.frame_inlier_ratio < _POSED_INLIERS).mean()) > _MAX_INTERPOLATED:
-            reasons.append("interpolated_frames")
+    if result.cuts:
+        reasons.append("shot_cut")
+    interpolated = float(result.trajectory.interpolated.mean())
+    if interpolated > _MAX_INTERPOLATED:
+        reasons.append("interpolated_frames")
+        fatal = fatal or interpolated > _MOSTLY_INTERPOLATED
     if result.focal.sigma_ratio > settings.focal_doubt_sigma:
         reasons.append("focal_unobservable")
     reliable: Reliability = "no" if fatal else "doubtful" if reasons else "yes"
+    to_source = source_width / result.working.width
     return Quality(
         reliable=reliable,
         reasons=tuple(reasons),
-        residual_px=found.residual_px * source_width / result.working.width,
+        residual_px=found.residual_px * to_source,
         inlier_ratio=found.inlier_ratio,
         coverage=found.coverage,
         parallax_deg=found.parallax_deg,
         focal_sigma_ratio=result.focal.sigma_ratio,
-        frame_inlier_ratio=result.frame_inlier_ratio,
+        frame_inlier_ratio=result.trajectory.inlier_ratio,
+        frame_residual_px=(result.trajectory.residual_px * to_source).astype(np.float32),
+        frame_coverage=result.trajectory.coverage,
+        frame_interpolated=result.trajectory.interpolated,
+        cuts=result.cuts,
+        loop_edges=result.loops.edges,
+        loop_residual_before_px=result.loops.residual_before_px * to_source,
+        loop_residual_after_px=result.loops.residual_after_px * to_source,
+        loop_moved_ratio=result.loops.moved_ratio,
     )

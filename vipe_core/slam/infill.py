@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import bisect
+from collections.abc import Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from typing import Any
@@ -14,14 +15,12 @@ from numpy.typing import NDArray
 from vipe_core.ba.problem import Edges, Free, Problem, State
 from vipe_core.geometry.arrays import interpolate_trajectory
 from vipe_core.priors.protocols import DenseMatcher, Match, SparseTracker
-from vipe_core.slam.adjustment import Adjuster, Step
-from vipe_core.slam.graph import Graph
-from vipe_core.slam.keyframes import KeyframeMap
+from vipe_core.slam.adjustment import Step
+from vipe_core.slam.frames import EncodedFrames
+from vipe_core.slam.mapping import ShotMap
 from vipe_core.slam.reprojection import Reprojector, relative_pose
 from vipe_core.slam.rotation import Link, RotationFitter
 from vipe_core.slam.selection import Report
-from vipe_core.slam.working import WorkingSize, working_frame
-from vipe_core.video.source import FrameSource
 
 Array = NDArray[Any]
 
@@ -32,16 +31,23 @@ _MIN_WEIGHT = 0.02
 
 @dataclass(frozen=True, slots=True)
 class Trajectory:
-    """Poses of all frames.
+    """Poses of all frames, and how well each is supported.
 
     Attributes:
-        cam_from_world: (N, 4, 4) float64.
+        cam_from_world: (N, 4, 4) float64; every shot has a world of its own.
+        residual_px: (N,) float32 median residual of the inliers of each frame, working pixels; NaN without any.
         inlier_ratio: (N,) float32 share of the measurements' weight within the robust scale; 0 where a pose could only
             be interpolated.
+        coverage: (N,) float32 share of the cells that fit: of a keyframe its own, of any other frame those of the
+            keyframe that sees it best.
+        interpolated: (N,) bool, True on frames whose pose is interpolated because nothing measures it.
     """
 
     cam_from_world: NDArray[np.float64]
+    residual_px: NDArray[np.float32]
     inlier_ratio: NDArray[np.float32]
+    coverage: NDArray[np.float32]
+    interpolated: NDArray[np.bool_]
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,66 +59,134 @@ class _Pending:
     matches: tuple[tuple[int, Match], ...]
 
 
-class Infill:
-    """Poses every frame of the video against the finished map.
+@dataclass(frozen=True, slots=True)
+class _Fit:
+    """How well a pose explains the measurements of its frame; see `Trajectory`."""
+
+    residual_px: float
+    inlier_ratio: float
+    coverage: float
+
+
+def fill_in(
+    maps: Sequence[ShotMap],
+    frames: EncodedFrames,
+    placed: NDArray[np.bool_],
+    reprojector: Reprojector,
+    batch: int,
+    report: Report,
+    tracks_only: SparseTracker | None = None,
+) -> Trajectory:
+    """Pose every frame of the video against the finished map of its shot; holds one batch of measurements at a time.
 
     Args:
-        graph: Says how raw weights are to be seen.
+        maps: Of the shots, in the order of the video.
+        placed: (N,) bool; frames that are False keep their interpolated pose.
         batch: Frames that are posed together.
-        rotation_only: Fits rotations instead of poses, for a camera that only turns.
         tracks_only: Gives the measurements instead of dense flow, which then only guides it.
+
+    Raises:
+        InputError, DecodeError: From the source.
+    """
+    count = len(frames)
+    trajectory = Trajectory(
+        np.tile(np.eye(4), (count, 1, 1)),
+        np.full(count, np.nan, dtype=np.float32),
+        np.zeros(count, dtype=np.float32),
+        np.zeros(count, dtype=np.float32),
+        np.ones(count, dtype=np.bool_),
+    )
+    times_s = np.array(frames.times_s)
+    shots = [
+        _ShotInfill(one, frames.matcher, reprojector, times_s, placed, trajectory, batch, tracks_only) for one in maps
+    ]
+    waiting = [shot for shot in shots if shot.moves]
+    if not waiting:
+        report("infill", count, count)
+        return trajectory
+    with closing(frames.again(waiting[0].start, waiting[-1].stop)) as stream:
+        for index, features in stream:
+            if index == waiting[0].stop:
+                waiting.pop(0).finish()
+            if placed[index] and index >= waiting[0].start:
+                waiting[0].add(index, features)
+            report("infill", index + 1, count)
+    waiting[0].finish()
+    return trajectory
+
+
+class _ShotInfill:
+    """Poses the frames of one shot, in order, into a `Trajectory`.
+
+    Attributes:
+        start, stop: The frames of the shot.
+        moves: Whether its frames have poses of their own to find.
     """
 
     def __init__(
         self,
-        keyframes: KeyframeMap,
-        graph: Graph,
+        shot_map: ShotMap,
         matcher: DenseMatcher,
-        adjuster: Adjuster,
         reprojector: Reprojector,
+        times_s: NDArray[np.float64],
+        placed: NDArray[np.bool_],
+        into: Trajectory,
         batch: int,
-        rotation_only: RotationFitter | None = None,
-        tracks_only: SparseTracker | None = None,
+        tracks_only: SparseTracker | None,
     ) -> None:
-        self._keyframes = keyframes
-        self._graph = graph
+        self.start, self.stop = shot_map.shot.start, shot_map.shot.stop
+        self.moves = shot_map.motion != "static"
+        self._keyframes = keyframes = shot_map.keyframes
+        self._graph = shot_map.graph
+        self._adjuster = shot_map.adjuster
+        self._fitter = shot_map.fitter
         self._matcher = matcher
-        self._adjuster = adjuster
         self._reprojector = reprojector
+        self._into = into
         self._batch = batch
-        self._rotation_only = rotation_only
         self._tracks_only = tracks_only
+        self._pending: list[_Pending] = []
+        frames = slice(self.start, self.stop)
+        if not self.moves:
+            # Every picture of a camera that stands still shows what its keyframe shows.
+            into.inlier_ratio[frames] = into.coverage[frames] = placed[frames]
+            into.residual_px[frames] = np.where(placed[frames], 0, np.nan)
+            into.interpolated[frames] = ~placed[frames]
+            return
+        into.cam_from_world[frames] = interpolate_trajectory(keyframes.times_s, keyframes.poses(), times_s[frames])
+        self._known = set(keyframes.frame_index)
+        for k, index in enumerate(keyframes.frame_index):
+            into.cam_from_world[index] = keyframes.pose(k)
+            into.residual_px[index] = shot_map.found.keyframe_residual_px[k]
+            into.inlier_ratio[index] = shot_map.found.keyframe_inlier_ratio[k]
+            into.coverage[index] = shot_map.found.keyframe_coverage[k]
+            into.interpolated[index] = False
 
-    def run(self, source: FrameSource, size: WorkingSize, times_s: Array, report: Report) -> Trajectory:
-        """Decode the video once more and pose its frames; holds one batch of measurements at a time.
+    def add(self, index: int, features: Any) -> None:
+        """Measure a frame; every so many are posed together."""
+        if index in self._known:
+            return
+        self._pending.append(self._measure(index, features, self._into.cam_from_world[index]))
+        if len(self._pending) == self._batch:
+            self.finish()
 
-        Raises:
-            InputError, DecodeError: From the source.
-        """
-        keyframes = self._keyframes
-        count = len(times_s)
-        knots = np.array(keyframes.times_s)
-        poses = np.asarray(interpolate_trajectory(knots, keyframes.poses(), times_s))
-        inlier_ratio = np.zeros(count, dtype=np.float32)
-        number = {index: k for k, index in enumerate(keyframes.frame_index)}
-        for index, k in number.items():
-            poses[index] = keyframes.pose(k)
-            inlier_ratio[index] = 1.0
-        pending: list[_Pending] = []
-        with closing(source.frames(size.size, stop=count)) as frames:
-            for frame in frames:
-                if frame.index not in number:
-                    features = self._matcher.encode(working_frame(frame))
-                    # Against a blank frame everything seems to stand still: it keeps its interpolated pose.
-                    if not self._matcher.is_blank(features):
-                        pending.append(self._measure(frame.index, features, poses[frame.index]))
-                    if len(pending) == self._batch:
-                        self._solve(pending, poses, inlier_ratio)
-                        pending = []
-                report("infill", frame.index + 1, count)
-        if pending:
-            self._solve(pending, poses, inlier_ratio)
-        return Trajectory(poses, inlier_ratio)
+    def finish(self) -> None:
+        """Pose the frames that wait; one that its measurements do not support keeps its interpolated pose."""
+        pending, self._pending = self._pending, []
+        if not pending:
+            return
+        solved = self._adjusted(pending) if self._fitter is None else self._turned(pending, self._fitter)
+        if solved is None:
+            return
+        into = self._into
+        for frame, pose in zip(pending, solved, strict=True):
+            fit = self._judged(frame, pose)
+            if fit.inlier_ratio >= _MIN_INLIERS and np.isfinite(pose).all():
+                into.cam_from_world[frame.index] = pose
+                into.residual_px[frame.index] = fit.residual_px
+                into.inlier_ratio[frame.index] = fit.inlier_ratio
+                into.coverage[frame.index] = fit.coverage
+                into.interpolated[frame.index] = False
 
     def _measure(self, index: int, features: Any, start: Array) -> _Pending:
         """Match a frame from the keyframe before it and the one after it, or from the last two."""
@@ -130,17 +204,6 @@ class Infill:
                 match = self._tracks_only.match(self._keyframes.features[k], features, match)
             matches.append((k, match))
         return _Pending(index, np.array(start), tuple(matches))
-
-    def _solve(self, pending: list[_Pending], poses: Array, inlier_ratio: Array) -> None:
-        """Fit the poses of a batch; a frame that its measurements do not support keeps its interpolated pose."""
-        solved = self._adjusted(pending) if self._rotation_only is None else self._turned(pending, self._rotation_only)
-        if solved is None:
-            return
-        for frame, pose in zip(pending, solved, strict=True):
-            ratio = self._inliers(frame, pose)
-            if ratio >= _MIN_INLIERS and np.isfinite(pose).all():
-                poses[frame.index] = pose
-                inlier_ratio[frame.index] = ratio
 
     def _turned(self, pending: list[_Pending], fitter: RotationFitter) -> NDArray[np.float64]:
         """(B, 4, 4) rotation-only poses of a batch."""
@@ -195,9 +258,10 @@ class Infill:
         result = self._adjuster.anneal(problem, state, _SCHEDULE)
         return None if result is None else result.state.cam_from_world[first:].cpu().numpy()
 
-    def _inliers(self, frame: _Pending, cam_from_world: Array) -> float:
-        """Share of the weight of a frame's measurements whose residual is within the robust scale."""
-        inside = total = 0.0
+    def _judged(self, frame: _Pending, cam_from_world: Array) -> _Fit:
+        """What the pose makes of the frame's measurements."""
+        inside = total = coverage = 0.0
+        errors = []
         for k, match in frame.matches:
             induced = self._reprojector.induced(
                 self._keyframes.intrinsics,
@@ -207,6 +271,11 @@ class Infill:
             weight = self._graph.weigh(match.weight).mean(axis=1) * self._keyframes.static(k)
             weight = np.where(weight > _MIN_WEIGHT, weight, 0)
             error = np.linalg.norm(induced.target_px - match.target_px, axis=1)
-            inside += float(weight[error < self._adjuster.robust_scale_px].sum())
+            fits = (weight > 0) & (error < self._adjuster.robust_scale_px)
+            inside += float(weight[fits].sum())
             total += float(weight.sum())
-        return inside / total if total > 0 else 0.0
+            coverage = max(coverage, float(fits.mean()))
+            errors.append(error[fits])
+        all_errors = np.concatenate(errors)
+        residual_px = float(np.median(all_errors)) if len(all_errors) else float("nan")
+        return _Fit(residual_px, inside / total if total > 0 else 0.0, coverage)

@@ -1,14 +1,14 @@
-"""Keyframe selection: one pass over the video that decides by motion (paper section 3.1, step 2).
+"""Keyframe selection: one pass over the video that decides by motion (paper section 3.1, step 2), shot by shot.
 
 The pass holds the keyframes' features and a bounded, evenly thinned sample of frames for the intrinsics
-initialisation; everything else about a frame is forgotten but its time.
+initialisation; everything else about a frame is forgotten but its time, unless the clip is short enough to be kept.
 """
 
 from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Callable, Generator
+from collections.abc import Callable
 from contextlib import closing
 from dataclasses import dataclass
 from typing import Any
@@ -16,11 +16,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vipe_core.errors import EmptyMedia
 from vipe_core.priors.protocols import DenseMatcher, WorkingFrame
+from vipe_core.slam.frames import EncodedFrames
 from vipe_core.slam.settings import SlamSettings
-from vipe_core.slam.working import WorkingSize, working_frame
-from vipe_core.video.source import FrameSource
+from vipe_core.slam.shots import Picture, Placed, ShotSplitter
+from vipe_core.slam.working import WorkingSize
 
 logger = logging.getLogger(__name__)
 
@@ -39,21 +39,36 @@ class Keyframe:
 
 
 @dataclass(frozen=True, slots=True)
+class Shot:
+    """Frames [start, stop) between two cuts.
+
+    Attributes:
+        keyframes: At least one, in time order. The first frame that is not blank is one; blank ones are none, unless
+            there is nothing else.
+        max_motion_px: Largest displacement of any frame against its keyframe, working pixels.
+    """
+
+    start: int
+    stop: int
+    keyframes: list[Keyframe]
+    max_motion_px: float
+
+
+@dataclass(frozen=True, slots=True)
 class Selection:
     """What the selection pass found.
 
     Attributes:
         timestamps_s: (N,) float64 presentation time of every frame.
-        keyframes: At least one, in time order. The first frame that is not blank is one; blank ones are none, unless
-            there is nothing else.
+        shots: At least one, in time order; together they are the whole video.
+        placed: (N,) bool, False on frames that belong to no shot: blank ones, flashes, torn ones.
         sample: Evenly thinned frames, at most `SlamSettings.sample_frames`.
-        max_motion_px: Largest displacement of any frame against its keyframe, working pixels.
     """
 
     timestamps_s: NDArray[np.float64]
-    keyframes: list[Keyframe]
+    shots: list[Shot]
+    placed: NDArray[np.bool_]
     sample: list[WorkingFrame]
-    max_motion_px: float
 
     @property
     def num_frames(self) -> int:
@@ -80,26 +95,20 @@ class _Thinned:
 
 
 class _MotionFilter:
-    """Makes a frame a keyframe when the picture has moved by `threshold_px` since the last one.
-
-    Blank frames (a fade from black, a flash) are passed over: any picture seems to stand still against them.
-    """
+    """Makes a frame a keyframe when the picture has moved by `threshold_px` since the last one."""
 
     def __init__(self, matcher: DenseMatcher, threshold_px: float) -> None:
         self.matcher = matcher
         self.threshold_px = threshold_px
+        self.num_frames = 0
         self.keyframes: list[Keyframe] = []
         self.max_motion_px = 0.0
         self.total_motion_px = 0.0
-        self._first_blank: Keyframe | None = None
         self._previous: Keyframe | None = None
         self._previous_motion_px = 0.0
 
-    def add(self, frame: WorkingFrame) -> None:
-        current = Keyframe(frame.index, self.matcher.encode(frame))
-        if self.matcher.is_blank(current.features):
-            self._first_blank = self._first_blank or current
-            return
+    def add(self, current: Keyframe) -> None:
+        self.num_frames += 1
         if not self.keyframes:
             self.keyframes.append(current)
             return
@@ -116,13 +125,19 @@ class _MotionFilter:
 
     def finish(self) -> None:
         """Consider the last frame: a keyframe when it adds a visible part of a step, so that nothing hangs over."""
-        if not self.keyframes and self._first_blank is not None:
-            self.keyframes.append(self._first_blank)
         if self._previous is not None:
             if self._previous_motion_px > 0.25 * self.threshold_px:
                 self._take(self._previous, self._previous_motion_px)
             else:
                 self.total_motion_px += self._previous_motion_px
+
+    def lowered(self, min_keyframes: int, static_px: float) -> _MotionFilter | None:
+        """A filter with a lower threshold for the same shot; None when this one has found enough or nothing moves."""
+        if len(self.keyframes) >= min(min_keyframes, self.num_frames) or self.max_motion_px < static_px:
+            return None
+        lower_px = max(0.5 * static_px, min(0.6 * self.threshold_px, self.total_motion_px / (min_keyframes + 2)))
+        logger.debug("%d keyframes are few: threshold lowered to %.2f px", len(self.keyframes), lower_px)
+        return _MotionFilter(self.matcher, lower_px)
 
     def _take(self, keyframe: Keyframe, motion_px: float) -> None:
         self.keyframes.append(keyframe)
@@ -134,59 +149,82 @@ class _MotionFilter:
         return motion_px if math.isfinite(motion_px) else 0.0
 
 
-def select_keyframes(
-    source: FrameSource, size: WorkingSize, matcher: DenseMatcher, settings: SlamSettings, report: Report
-) -> Selection:
-    """Decode the video once (again for each lowering of the threshold of a slow clip) and choose keyframes.
+class _Pass:
+    """One motion filter per shot, and which frame goes to which."""
+
+    def __init__(self, matcher: DenseMatcher, threshold_px: float) -> None:
+        self._matcher = matcher
+        self._threshold_px = threshold_px
+        self.filters: list[_MotionFilter] = []
+        self.cuts: list[int] = []
+        self.shot_of: dict[int, int] = {}
+
+    def place(self, placed: list[Placed]) -> None:
+        for picture, cut in ((one.picture, one.cut) for one in placed):
+            if cut:
+                self.cuts.append(picture.index)
+            if cut or not self.filters:
+                self.filters.append(_MotionFilter(self._matcher, self._threshold_px))
+            self.shot_of[picture.index] = len(self.filters) - 1
+            self.filters[-1].add(Keyframe(picture.index, picture.features))
+
+
+def select_keyframes(frames: EncodedFrames, size: WorkingSize, settings: SlamSettings, report: Report) -> Selection:
+    """Read the video once (again for each lowering of the threshold of slow shots), find its cuts, choose keyframes.
+
+    Blank frames (a fade from black) and single ones that belong to nothing (a flash) are passed over: any picture
+    seems to stand still against them.
+
+    Args:
+        frames: Before their first pass.
 
     Raises:
         EmptyMedia: The video holds no frame.
         InputError, DecodeError: From the source.
     """
-    times: list[float] = []
+    matcher = frames.matcher
     thinned = _Thinned(settings.sample_frames)
-    threshold_px = settings.scaled_px(settings.keyframe_motion_px, size.width)
     static_px = settings.scaled_px(settings.static_motion_px, size.width)
-
-    def first_pass() -> Generator[WorkingFrame, None, None]:
-        with closing(source.frames(size.size)) as frames:
-            for frame in frames:
-                work = working_frame(frame)
-                times.append(frame.timestamp_s)
-                thinned.add(work)
-                yield work
-                report("scan", len(times), source.info.num_frames_hint)
-
-    def again() -> Generator[WorkingFrame, None, None]:
-        if thinned.spacing == 1:
-            yield from thinned.frames
-            return
-        with closing(source.frames(size.size, stop=len(times))) as frames:
-            for frame in frames:
-                yield working_frame(frame)
-                # No progress, but the chance to cancel and the sign of life that a supervisor waits for.
-                report("scan", len(times), len(times))
-
-    motion = _filter(first_pass(), matcher, threshold_px)
-    if not times:
-        raise EmptyMedia(f"{source.info.name}: the video holds no frame; check the recording")
-    for _ in range(_MAX_LOWERINGS):
-        enough = len(motion.keyframes) >= min(settings.min_keyframes, len(times))
-        if enough or motion.max_motion_px < static_px:
-            break
-        threshold_px = max(
-            0.5 * static_px, min(0.6 * threshold_px, motion.total_motion_px / (settings.min_keyframes + 2))
-        )
-        logger.debug("%d keyframes are few: threshold lowered to %.2f px", len(motion.keyframes), threshold_px)
-        motion = _filter(again(), matcher, threshold_px)
-    return Selection(np.array(times, dtype=np.float64), motion.keyframes, thinned.frames, motion.max_motion_px)
-
-
-def _filter(stream: Generator[WorkingFrame, None, None], matcher: DenseMatcher, threshold_px: float) -> _MotionFilter:
-    motion = _MotionFilter(matcher, threshold_px)
+    splitter = ShotSplitter(matcher)
+    found = _Pass(matcher, settings.scaled_px(settings.keyframe_motion_px, size.width))
+    first_blank: Keyframe | None = None
     # Closed here and not whenever an exception's traceback lets go of it: a decoder process is behind it.
-    with closing(stream) as frames:
-        for frame in frames:
-            motion.add(frame)
-    motion.finish()
-    return motion
+    with closing(frames.first_pass()) as first_pass:
+        for frame, features in first_pass:
+            thinned.add(frame)
+            if matcher.is_blank(features):
+                first_blank = first_blank or Keyframe(frame.index, features)
+            else:
+                found.place(splitter.add(Picture.of(frame, features)))
+            report("scan", frame.index + 1, frames.total_hint)
+    found.place(splitter.finish())
+    for motion in found.filters:
+        motion.finish()
+    for _ in range(_MAX_LOWERINGS):
+        lowered = [motion.lowered(settings.min_keyframes, static_px) for motion in found.filters]
+        if not any(lowered):
+            break
+        with closing(frames.again()) as again:
+            for index, features in again:
+                lower = lowered[found.shot_of[index]] if index in found.shot_of else None
+                if lower is not None:
+                    lower.add(Keyframe(index, features))
+                # No progress, but the chance to cancel and the sign of life that a supervisor waits for.
+                report("scan", len(frames), len(frames))
+        for number, lower in enumerate(lowered):
+            if lower is not None:
+                lower.finish()
+                found.filters[number] = lower
+    count = len(frames)
+    if not found.filters:
+        assert first_blank is not None
+        shots = [Shot(0, count, [first_blank], 0.0)]
+    else:
+        starts = [0, *found.cuts]
+        shots = [
+            Shot(start, stop, motion.keyframes, motion.max_motion_px)
+            for start, stop, motion in zip(starts, [*found.cuts, count], found.filters, strict=True)
+        ]
+    placed = np.zeros(count, dtype=np.bool_)
+    placed[list(found.shot_of)] = True
+    return Selection(np.array(frames.times_s, dtype=np.float64), shots, placed, thinned.frames)

@@ -43,6 +43,7 @@ class SlamSettings:
         keyframe_motion_px: Median textured displacement that makes a new keyframe.
         min_keyframes: The displacement is lowered until a moving clip has this many keyframes.
         static_motion_px: A clip whose every frame stays below this displacement has no camera motion.
+        frame_cache_bytes: A clip whose working pictures fit is decoded and encoded once.
         sample_frames: Bound on the frames held for the intrinsics initialisation.
         neighbours: Previous keyframes that a new one is matched with.
         window: Keyframes that the sliding window optimises.
@@ -63,6 +64,7 @@ class SlamSettings:
     keyframe_motion_px: float = 24.0
     min_keyframes: int = 8
     static_motion_px: float = 1.0
+    frame_cache_bytes: int = 256 << 20
     sample_frames: int = 128
     neighbours: int = 2
     window: int = 8

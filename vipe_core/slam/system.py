@@ -2,13 +2,9 @@
 
 from __future__ import annotations
 
-import logging
 import math
-import time
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 import torch
@@ -19,31 +15,20 @@ from vipe_core.cameras import Camera
 from vipe_core.errors import ConfigError
 from vipe_core.geometry.arrays import inverse
 from vipe_core.priors.protocols import IntrinsicsEstimate, PriorFamily
-from vipe_core.slam.adjustment import Adjuster, FocalPrior
-from vipe_core.slam.backend import Backend, FocalReport
-from vipe_core.slam.bootstrap import Bootstrap
-from vipe_core.slam.diagnostics import MapReport, examine
-from vipe_core.slam.graph import Graph
-from vipe_core.slam.infill import Infill
-from vipe_core.slam.keyframes import KeyframeMap
-from vipe_core.slam.measuring import MeasuredGraph
-from vipe_core.slam.reprojection import Reprojector
-from vipe_core.slam.rotation import Link, RotationFitter
-from vipe_core.slam.selection import Report, Selection, select_keyframes
+from vipe_core.slam.adjustment import FocalPrior
+from vipe_core.slam.backend import FocalReport
+from vipe_core.slam.diagnostics import LoopReport, MapReport, combine
+from vipe_core.slam.frames import EncodedFrames
+from vipe_core.slam.infill import Trajectory, fill_in
+from vipe_core.slam.mapping import Motion, ShotMap, ShotMapper
+from vipe_core.slam.selection import Report, Selection, Shot, select_keyframes
 from vipe_core.slam.settings import SlamSettings
-from vipe_core.slam.tracking import Tracker
+from vipe_core.slam.timing import StageClock
 from vipe_core.slam.working import WorkingSize, working_size
 from vipe_core.video.source import FrameSource
 
-logger = logging.getLogger(__name__)
-
-Motion = Literal["general", "rotation", "static"]
-
-# Below this parallax it is worth asking whether the camera only turned.
-_MAYBE_ROTATION_DEG = 1.5
-# Rotations alone explain a clip when their residual is within this of the full model's.
-_ROTATION_RATIO = 1.3
-_ROTATION_SLACK_PX = 0.05
+# How closely the later shots hold the focal length that the main one found: they share a camera.
+_SAME_FOCAL_SIGMA = 1e-4
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,23 +36,27 @@ class SlamResult:
     """What the SLAM stage hands on.
 
     Attributes:
-        world_from_cam: (N, 4, 4) float64; the world is the first camera.
-        frame_inlier_ratio: (N,) float32 share of each frame's measurements that its pose explains.
+        world_from_cam: (N, 4, 4) float64; the world is the first camera. Nothing measures the step over a cut: the
+            camera stands still there.
+        trajectory: How well each frame's pose is supported.
         timestamps_s: (N,) float64.
+        cuts: First frames of the shots but the first.
         keyframes: (K,) int64 frame indices.
         inverse_depth: (K, P) float32 of each keyframe's cells, along the rays of the camera model.
         static: (K, P) bool, False on cells that appear to move by themselves.
         working: Size of the images that the cells belong to.
         camera: At the working size.
-        motion: What kind of camera motion was found.
-        focal: What is known of the focal length.
+        motion: What kind of camera motion was found in the main shot, the one with most keyframes.
+        focal: What is known of the focal length, from the main shot.
         map: Diagnostics, with the confidence of every inverse depth.
+        loops: What the loop edges of the main shot did.
         timings_s: Wall seconds per stage.
     """
 
     world_from_cam: NDArray[np.float64]
-    frame_inlier_ratio: NDArray[np.float32]
+    trajectory: Trajectory
     timestamps_s: NDArray[np.float64]
+    cuts: tuple[int, ...]
     keyframes: NDArray[np.int64]
     inverse_depth: NDArray[np.float32]
     static: NDArray[np.bool_]
@@ -76,6 +65,7 @@ class SlamResult:
     motion: Motion
     focal: FocalReport
     map: MapReport
+    loops: LoopReport
     timings_s: dict[str, float]
 
     @property
@@ -106,118 +96,69 @@ class Slam:
         Raises:
             InputError, DecodeError: From the source; EmptyMedia when it holds no frame.
         """
-        timings: dict[str, float] = {}
-        size = working_size(source.info.width, source.info.height, self._settings.working_area_px)
-        with _timed(timings, "scan"):
-            selection = select_keyframes(source, size, self._priors.matcher, self._settings, report)
-        with _timed(timings, "intrinsics"):
-            estimate = self._initial_camera(source, selection, size)
+        clock = StageClock()
+        settings = self._settings
+        size = working_size(source.info.width, source.info.height, settings.working_area_px)
+        frames = EncodedFrames(source, size, self._priors.matcher, settings.frame_cache_bytes)
+        with clock("scan"):
+            selection = select_keyframes(frames, size, settings, report)
+        main = max(range(len(selection.shots)), key=lambda number: len(selection.shots[number].keyframes))
+        with clock("intrinsics"):
+            estimate = self._initial_camera(source, selection, selection.shots[main], size)
             report("intrinsics", 1, 1)
-        reprojector = Reprojector("pinhole", size.grid)
-        keyframes = KeyframeMap(size.grid, estimate.camera.index_params())
-        graph = Graph()
-        prior = FocalPrior(math.log(estimate.camera.focal_px), estimate.log_focal_sigma)
-        adjuster = Adjuster(self._settings, self._device, prior, self._settings.scaled_px(1.0, size.width))
-        terms = self._settings.terms
-        measured = MeasuredGraph(
-            keyframes,
-            graph,
-            self._priors.matcher,
-            self._priors.tracker if terms.sparse_tracks else None,
-            self._priors.points,
-            reprojector,
-            dense_flow=terms.dense_flow,
-        )
-        backend = Backend(measured, adjuster, reprojector, self._settings, size.width)
-        static = selection.max_motion_px < self._settings.scaled_px(self._settings.static_motion_px, size.width)
-        chosen = selection.keyframes[:1] if static else selection.keyframes
-        tracker = Tracker(measured, adjuster, reprojector, self._settings, self._settings.scaled_px(1.0, size.width))
-        with _timed(timings, "track"):
-            times_s = [float(selection.timestamps_s[keyframe.index]) for keyframe in chosen]
-            first = min(len(chosen), self._settings.min_keyframes)
-            Bootstrap(measured, adjuster, reprojector, self._settings.neighbours).run(chosen[:first], times_s[:first])
-            for done, keyframe in enumerate(chosen, start=1):
-                if done > first:
-                    tracker.add(keyframe, times_s[done - 1])
-                if done < first:
-                    continue
-                if done in self._settings.backend_at and done < len(chosen):
-                    backend.run()
-                report("track", keyframe.index + 1, selection.num_frames)
-        with _timed(timings, "backend"):
-            backend.run()
-            report("backend", 1, 1)
-        found = examine(reprojector, keyframes, graph, adjuster.robust_scale_px)
-        motion: Motion = "static" if static else "general"
-        focal = backend.focal
-        fitter = RotationFitter("pinhole", size.grid, adjuster.robust_scale_px)
-        if not static and found.parallax_deg < _MAYBE_ROTATION_DEG:
-            with _timed(timings, "rotation"):
-                turned = self._rotation_only(fitter, keyframes, graph, adjuster.focal_prior, found)
-            if turned is not None:
-                motion, focal = "rotation", turned
-                found = examine(reprojector, keyframes, graph, adjuster.robust_scale_px)
-        with _timed(timings, "infill"):
-            if static:
-                cam_from_world = np.tile(np.eye(4), (selection.num_frames, 1, 1))
-                frame_inliers = np.ones(selection.num_frames, dtype=np.float32)
-                report("infill", selection.num_frames, selection.num_frames)
-            else:
-                infill = Infill(
-                    keyframes,
-                    graph,
-                    self._priors.matcher,
-                    adjuster,
-                    reprojector,
-                    self._settings.infill_batch,
-                    fitter if motion == "rotation" else None,
-                    tracks_only=None if terms.dense_flow else self._priors.tracker,
-                )
-                trajectory = infill.run(source, size, selection.timestamps_s, report)
-                cam_from_world, frame_inliers = trajectory.cam_from_world, trajectory.inlier_ratio
-        world_from_cam = inverse(cam_from_world)
+        mapper = ShotMapper(self._priors, settings, self._device, size, selection.timestamps_s, clock)
+        maps = self._map(mapper, selection, main, estimate, report)
+        with clock("infill"):
+            tracks_only = None if settings.terms.dense_flow else self._priors.tracker
+            trajectory = fill_in(
+                maps, frames, selection.placed, mapper.reprojector, settings.infill_batch, report, tracks_only
+            )
+            frames.release()
         return SlamResult(
-            world_from_cam=cam_from_world[0] @ world_from_cam,
-            frame_inlier_ratio=frame_inliers,
+            world_from_cam=_joined(maps, trajectory.cam_from_world),
+            trajectory=trajectory,
             timestamps_s=selection.timestamps_s,
-            keyframes=np.array(keyframes.frame_index, dtype=np.int64),
-            inverse_depth=keyframes.depths(),
-            static=keyframes.statics(),
+            cuts=tuple(shot.start for shot in selection.shots[1:]),
+            keyframes=np.concatenate([np.array(one.keyframes.frame_index, dtype=np.int64) for one in maps]),
+            inverse_depth=np.concatenate([one.keyframes.depths() for one in maps]),
+            static=np.concatenate([one.keyframes.statics() for one in maps]),
             working=size,
-            camera=Camera.from_index_params("pinhole", keyframes.intrinsics, size.width, size.height),
-            motion=motion,
-            focal=focal,
-            map=found,
-            timings_s=timings,
+            camera=Camera.from_index_params("pinhole", maps[main].keyframes.intrinsics, size.width, size.height),
+            motion=maps[main].motion,
+            focal=maps[main].focal,
+            map=combine([one.found for one in maps]),
+            loops=maps[main].loops,
+            timings_s=clock.seconds,
         )
 
-    def _rotation_only(
-        self, fitter: RotationFitter, keyframes: KeyframeMap, graph: Graph, prior: FocalPrior, found: MapReport
-    ) -> FocalReport | None:
-        """Replace the map by rotations when they explain the measurements as well as poses and depths do."""
-        links = [Link(i, j, graph[i, j], np.ones(keyframes.grid.num_cells, dtype=np.bool_)) for i, j in graph]
-        if not links:
-            return None
-        inflation = self._settings.focal_sigma_inflation
-        start = fitter.chain(len(keyframes), links, keyframes.intrinsics)
-        scaled = FocalPrior(prior.log_focal, prior.sigma / inflation)
-        fit = fitter.fit(start, (0,), links, keyframes.intrinsics, scaled)
-        logger.debug("rotation only: %.3f px, with positions: %.3f px", fit.residual_px, found.residual_px)
-        if not fit.residual_px <= _ROTATION_RATIO * found.residual_px + _ROTATION_SLACK_PX:
-            return None
-        keyframes.intrinsics = fit.intrinsics
-        for k, rotation in enumerate(fit.rotations):
-            pose = np.eye(4)
-            pose[:3, :3] = rotation
-            keyframes.set_pose(k, pose)
-            keyframes.set_depth(k, np.ones(keyframes.grid.num_cells))
-            keyframes.set_static(k, np.ones(keyframes.grid.num_cells, dtype=np.bool_))
-        sigma = inflation * fit.log_focal_sigma
-        return FocalReport(sigma, observed=sigma < prior.sigma)
+    def _map(
+        self, mapper: ShotMapper, selection: Selection, main: int, estimate: IntrinsicsEstimate, report: Report
+    ) -> list[ShotMap]:
+        """The maps of all shots, in order. The main one finds the focal length, the others take it over."""
+        intrinsics = estimate.camera.index_params()
+        prior = FocalPrior(math.log(estimate.camera.focal_px), estimate.log_focal_sigma)
+        maps: dict[int, ShotMap] = {}
+        done = 0
+        for number in [main, *(k for k in range(len(selection.shots)) if k != main)]:
+            shot, before = selection.shots[number], done
 
-    def _initial_camera(self, source: FrameSource, selection: Selection, size: WorkingSize) -> IntrinsicsEstimate:
+            def tracked(index: int, shot: Shot = shot, before: int = before) -> None:
+                report("track", before + index - shot.start, selection.num_frames)
+
+            maps[number] = mapper.run(shot, intrinsics, prior, tracked, lambda: None)
+            done += shot.stop - shot.start
+            if number == main:
+                intrinsics = maps[main].keyframes.intrinsics
+                prior = FocalPrior(math.log(float(intrinsics[0])), _SAME_FOCAL_SIGMA)
+        report("backend", 1, 1)
+        return [maps[number] for number in range(len(maps))]
+
+    def _initial_camera(
+        self, source: FrameSource, selection: Selection, shot: Shot, size: WorkingSize
+    ) -> IntrinsicsEstimate:
         """The initial camera at the working size, with pixels that are square in the source video."""
-        estimate = self._priors.intrinsics.estimate(selection.sample, size.grid)
+        sample = [frame for frame in selection.sample if shot.start <= frame.index < shot.stop]
+        estimate = self._priors.intrinsics.estimate(sample, size.grid)
         scale_x, scale_y = size.width / source.info.width, size.height / source.info.height
         focal_px = estimate.camera.focal_px / math.sqrt(scale_x * scale_y)
         width, height = source.info.width, source.info.height
@@ -225,10 +166,12 @@ class Slam:
         return IntrinsicsEstimate(square.resized(size.width, size.height), estimate.log_focal_sigma, estimate.num_pairs)
 
 
-@contextmanager
-def _timed(timings: dict[str, float], stage: str) -> Iterator[None]:
-    start = time.perf_counter()
-    try:
-        yield
-    finally:
-        timings[stage] = time.perf_counter() - start
+def _joined(maps: Sequence[ShotMap], cam_from_world: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(N, 4, 4) world_from_cam in the world of the first camera: each shot goes on where the one before it ended."""
+    world_from_cam = np.empty_like(cam_from_world)
+    anchor = np.eye(4)
+    for one in maps:
+        frames = slice(one.shot.start, one.shot.stop)
+        world_from_cam[frames] = anchor @ cam_from_world[one.shot.start] @ inverse(cam_from_world[frames])
+        anchor = world_from_cam[one.shot.stop - 1]
+    return world_from_cam

@@ -1,0 +1,167 @@
+"""The map of one shot: bootstrap, tracking, global adjustment, and what to make of a camera that does not travel."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from vipe_core.priors.protocols import PriorFamily
+from vipe_core.slam.adjustment import Adjuster, FocalPrior
+from vipe_core.slam.backend import Backend, FocalReport
+from vipe_core.slam.bootstrap import Bootstrap
+from vipe_core.slam.diagnostics import LoopReport, MapReport, examine, examine_loops
+from vipe_core.slam.graph import Graph
+from vipe_core.slam.keyframes import KeyframeMap
+from vipe_core.slam.measuring import MeasuredGraph
+from vipe_core.slam.reprojection import Reprojector
+from vipe_core.slam.rotation import Link, RotationFitter
+from vipe_core.slam.selection import Shot
+from vipe_core.slam.settings import SlamSettings
+from vipe_core.slam.timing import StageClock
+from vipe_core.slam.tracking import Tracker
+from vipe_core.slam.working import WorkingSize
+
+logger = logging.getLogger(__name__)
+
+Motion = Literal["general", "rotation", "static"]
+
+# Below this parallax it is worth asking whether the camera only turned.
+_MAYBE_ROTATION_DEG = 1.5
+# Rotations alone explain a clip when their residual is within this of the full model's.
+_ROTATION_RATIO = 1.3
+_ROTATION_SLACK_PX = 0.05
+
+
+@dataclass(frozen=True, slots=True)
+class ShotMap:
+    """The finished map of one shot, in a world of its own.
+
+    Attributes:
+        shot: Which frames it is of.
+        motion: What kind of camera motion was found.
+        focal: What its adjustment says about the focal length.
+        found: Diagnostics.
+        loops: What its loop edges did.
+        adjuster: Ran its adjustments.
+        fitter: Fits rotations, where there is nothing else to fit.
+    """
+
+    shot: Shot
+    keyframes: KeyframeMap
+    graph: Graph
+    motion: Motion
+    focal: FocalReport
+    found: MapReport
+    loops: LoopReport
+    adjuster: Adjuster
+    fitter: RotationFitter | None
+
+
+class ShotMapper:
+    """Maps shots of one video, one after the other."""
+
+    def __init__(
+        self,
+        priors: PriorFamily,
+        settings: SlamSettings,
+        device: torch.device,
+        size: WorkingSize,
+        timestamps_s: NDArray[np.float64],
+        clock: StageClock,
+    ) -> None:
+        self._priors = priors
+        self._settings = settings
+        self._device = device
+        self._size = size
+        self._times_s = timestamps_s
+        self._clock = clock
+        self.reprojector = Reprojector("pinhole", size.grid)
+
+    def run(
+        self,
+        shot: Shot,
+        intrinsics: NDArray[np.float64],
+        prior: FocalPrior,
+        tracked: Callable[[int], None],
+        adjusting: Callable[[], None],
+    ) -> ShotMap:
+        """Map a shot.
+
+        Args:
+            intrinsics: (K,) index parameters to start from.
+            tracked: Told the frame up to which the shot is tracked.
+            adjusting: Called before the final global adjustment.
+        """
+        settings, size, reprojector = self._settings, self._size, self.reprojector
+        scale_px = settings.scaled_px(1.0, size.width)
+        keyframes, graph = KeyframeMap(size.grid, intrinsics), Graph()
+        adjuster = Adjuster(settings, self._device, prior, scale_px)
+        measured = MeasuredGraph(
+            keyframes,
+            graph,
+            self._priors.matcher,
+            self._priors.tracker if settings.terms.sparse_tracks else None,
+            self._priors.points,
+            reprojector,
+            dense_flow=settings.terms.dense_flow,
+        )
+        backend = Backend(measured, adjuster, reprojector, settings, size.width)
+        static = shot.max_motion_px < settings.scaled_px(settings.static_motion_px, size.width)
+        chosen = shot.keyframes[:1] if static else shot.keyframes
+        times_s = [float(self._times_s[keyframe.index]) for keyframe in chosen]
+        tracker = Tracker(measured, adjuster, reprojector, settings, scale_px)
+        with self._clock("track"):
+            first = min(len(chosen), settings.min_keyframes)
+            Bootstrap(measured, adjuster, reprojector, settings.neighbours).run(chosen[:first], times_s[:first])
+            for done in range(first, len(chosen) + 1):
+                if done > first:
+                    tracker.add(chosen[done - 1], times_s[done - 1])
+                if done in settings.backend_at and done < len(chosen):
+                    backend.run()
+                tracked(chosen[done - 1].index + 1)
+        before = keyframes.snapshot()
+        with self._clock("backend"):
+            adjusting()
+            backend.run()
+        loops = examine_loops(reprojector, keyframes, graph, before, settings.neighbours)
+        found = examine(reprojector, keyframes, graph, adjuster.robust_scale_px)
+        motion: Motion = "static" if static else "general"
+        focal, fitter = backend.focal, None
+        if not static and found.parallax_deg < _MAYBE_ROTATION_DEG:
+            candidate = RotationFitter("pinhole", size.grid, adjuster.robust_scale_px)
+            with self._clock("rotation"):
+                turned = self._rotation_only(candidate, keyframes, graph, prior, found)
+            if turned is not None:
+                motion, focal, fitter = "rotation", turned, candidate
+                found = examine(reprojector, keyframes, graph, adjuster.robust_scale_px)
+        return ShotMap(shot, keyframes, graph, motion, focal, found, loops, adjuster, fitter)
+
+    def _rotation_only(
+        self, fitter: RotationFitter, keyframes: KeyframeMap, graph: Graph, prior: FocalPrior, found: MapReport
+    ) -> FocalReport | None:
+        """Replace the map by rotations when they explain the measurements as well as poses and depths do."""
+        links = [Link(i, j, graph[i, j], np.ones(keyframes.grid.num_cells, dtype=np.bool_)) for i, j in graph]
+        if not links:
+            return None
+        inflation = self._settings.focal_sigma_inflation
+        start = fitter.chain(len(keyframes), links, keyframes.intrinsics)
+        scaled = FocalPrior(prior.log_focal, prior.sigma / inflation)
+        fit = fitter.fit(start, (0,), links, keyframes.intrinsics, scaled)
+        logger.debug("rotation only: %.3f px, with positions: %.3f px", fit.residual_px, found.residual_px)
+        if not fit.residual_px <= _ROTATION_RATIO * found.residual_px + _ROTATION_SLACK_PX:
+            return None
+        keyframes.intrinsics = fit.intrinsics
+        for k, rotation in enumerate(fit.rotations):
+            pose = np.eye(4)
+            pose[:3, :3] = rotation
+            keyframes.set_pose(k, pose)
+            keyframes.set_depth(k, np.ones(keyframes.grid.num_cells))
+            keyframes.set_static(k, np.ones(keyframes.grid.num_cells, dtype=np.bool_))
+        sigma = inflation * fit.log_focal_sigma
+        return FocalReport(sigma, observed=sigma < prior.sigma)
