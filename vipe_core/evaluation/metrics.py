@@ -84,12 +84,17 @@ class CameraErrors:
 
 
 def trajectory_errors(
-    estimate: NDArray[np.float64], truth: NDArray[np.float64], frame_index: NDArray[np.int64] | None = None
+    estimate: NDArray[np.float64],
+    truth: NDArray[np.float64],
+    frame_index: NDArray[np.int64] | None = None,
+    *,
+    with_scale: bool = True,
 ) -> TrajectoryErrors:
     """Compares `estimate` with `truth`, both world_from_cam (N, 4, 4) of the same frames.
 
     Args:
         frame_index: (N,) frame numbers; only pairs one apart count as consecutive. Default: all are.
+        with_scale: Align by a similarity; otherwise rigidly, where both are in the same units.
 
     Raises:
         ValueError: Shapes disagree or there are fewer than two poses.
@@ -100,14 +105,14 @@ def trajectory_errors(
     path_length = float(np.linalg.norm(np.diff(true_centres, axis=0), axis=1).sum())
     moves = path_length > _MOVES and _spread(true_centres) > _MOVES
 
-    world = _nearest_rotation(np.einsum("nij,nkj->ik", truth[:, :3, :3], estimate[:, :3, :3]))
+    world = _mean_rotation(estimate, truth)
     apart = np.einsum("nji,jk,nkl->nil", truth[:, :3, :3], world, estimate[:, :3, :3])
     rotation_rmse_deg = _rms(rotation_angle_deg(apart))
 
     scale: float | None = None
     ate: float | None = None
     if moves and _spread(centres) > 1e-12:
-        truth_from_estimate = _align(centres, true_centres, world)
+        truth_from_estimate = align_centres(estimate, truth, with_scale=with_scale)
         scale = truth_from_estimate.scale
         ate = _rms(np.linalg.norm(truth_from_estimate.apply(centres) - true_centres, axis=1))
     elif moves:
@@ -282,14 +287,27 @@ def rotation_angle_deg(rotation: NDArray[np.float64]) -> NDArray[np.float64]:
     return angle
 
 
-def _align(points: NDArray[np.float64], target: NDArray[np.float64], world: NDArray[np.float64]) -> Sim3:
-    """The least-squares Sim(3); on a straight path, where the roll is not determined, with the rotation `world`."""
+def align_centres(estimate: NDArray[np.float64], truth: NDArray[np.float64], *, with_scale: bool = True) -> Sim3:
+    """truth_from_estimate: the least-squares Sim(3) (or rigid motion) of the camera centres of (N, 4, 4) poses.
+
+    On a straight path, where the centres do not determine the roll, with the rotation that the cameras agree on.
+
+    Raises:
+        ValueError: With scale: all centres of one trajectory coincide.
+    """
+    points, target = estimate[:, :3, 3], truth[:, :3, 3]
     singular = np.linalg.svd((target - target.mean(0)).T @ (points - points.mean(0)), compute_uv=False)
     if singular[1] > 1e-10 * singular[0]:
-        return umeyama(points, target)
+        return umeyama(points, target, with_scale)
+    world = _mean_rotation(estimate, truth)
     centred, centred_target = points - points.mean(0), target - target.mean(0)
     turned = centred @ world.T
-    scale = float((centred_target * turned).sum() / (centred**2).sum())
+    scale = 1.0
+    if with_scale:
+        size = float((centred**2).sum())
+        if not size > 0:
+            raise ValueError("no scale: all centres of the estimate coincide")
+        scale = float((centred_target * turned).sum()) / size
     return Sim3(scale, world, target.mean(0) - scale * world @ points.mean(0))
 
 
@@ -319,6 +337,11 @@ def _align_depth(
         if abs(scale - before[0]) < 1e-9 * abs(scale) and abs(shift - before[1]) < floor:
             break
     return scale, shift
+
+
+def _mean_rotation(estimate: NDArray[np.float64], truth: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The constant rotation of the world that makes the cameras of the two agree best."""
+    return _nearest_rotation(np.einsum("nij,nkj->ik", truth[:, :3, :3], estimate[:, :3, :3]))
 
 
 def _nearest_rotation(matrix: NDArray[np.float64]) -> NDArray[np.float64]:

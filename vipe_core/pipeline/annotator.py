@@ -55,20 +55,20 @@ class Annotator:
         set_threads(threads)
 
     def annotate(
-        self, path: str | Path, *, name: str | None = None, progress: ProgressCallback | None = None
+        self, video: str | Path | FrameSource, *, name: str | None = None, progress: ProgressCallback | None = None
     ) -> Annotation:
         """Poses, camera and quality of a video file or a directory of images; dense depth when it is asked for.
 
         Args:
-            path: A video file, or a directory of images in order of their names.
-            name: Name of the sequence; the sanitised stem if None.
+            video: A video file, a directory of images in order of their names, or frames from elsewhere.
+            name: Name of the sequence; the sanitised stem if None. Frames from elsewhere have theirs.
             progress: Told how far the annotation is; an exception out of it ends the annotation.
 
         Raises:
             InputError, DecodeError: The input cannot be read. Its code and message are meant for the user.
             EngineError: A stage failed, a defect of ours; what went wrong is its `__cause__`. So does the dense stream.
         """
-        source = open_source(path, name=name)
+        source = open_source(video, name=name) if isinstance(video, (str, Path)) else video
         report = _Reporter(progress)
 
         # New matchers for each video: OpenCV's flow object keeps buffers of the last picture size and is not safe to
