@@ -9,7 +9,7 @@ from typing import Annotated, ParamSpec, TypeVar
 
 import typer
 
-from services.cli import annotate, data, demo, jobs, serve
+from services.cli import annotate, data, demo, evaluate, jobs, serve
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -64,6 +64,7 @@ def _typed_errors(command: Callable[P, R]) -> Callable[P, R]:
 _COMMANDS: dict[str, Callable[..., None]] = {
     "annotate": annotate.annotate,
     "demo": demo.demo,
+    "eval": evaluate.evaluate,
     "up": serve.up,
     "api": serve.api,
     "agent": serve.agent,

@@ -26,8 +26,12 @@ class PointMatcher(Protocol):
     """Finds points that two pictures have in common.
 
     Attributes:
+        kind: What `point_matcher` makes another one of.
         name: For reports: figures by different matchers do not compare.
     """
+
+    @property
+    def kind(self) -> str: ...
 
     @property
     def name(self) -> str: ...
@@ -42,6 +46,7 @@ class PointMatcher(Protocol):
 class SiftMatcher:
     """SIFT with the ratio test in both directions. No geometry is imposed, so nothing is hidden from the metric."""
 
+    kind = "sift"
     name = "SIFT"
 
     def __init__(self) -> None:
@@ -73,6 +78,7 @@ class LightGlueMatcher:
         ConfigError: kornia is not installed, or its weights cannot be had.
     """
 
+    kind = "lightglue"
     name = "LightGlue (DISK)"
 
     def __init__(self, device: str = "cpu") -> None:

@@ -23,6 +23,7 @@ from vipe_core.geometry import Sim3, umeyama
 DepthAlignment = Literal["metric", "scale", "scale_shift"]
 """`metric`: none. `scale`: the median of truth / estimate. `scale_shift`: scale and offset with the least absolute
 error. One for all frames of a sequence, never per frame."""
+DEPTH_ALIGNMENTS: tuple[DepthAlignment, ...] = ("metric", "scale", "scale_shift")
 
 _MAX_FITTED = 1_000_000  # values that scale and shift are fitted to; more say nothing new
 _MOVES = 1e-6  # metres: below this path length or spread a trajectory counts as standing still
