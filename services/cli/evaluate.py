@@ -235,4 +235,5 @@ def _show(title: str, headings: Sequence[str], rows: Sequence[Sequence[str]]) ->
         table.add_column(heading, justify="left" if number == 0 else "right")
     for row in rows:
         table.add_row(*row)
-    results_console().print(table)
+    widest = [max(len(row[number]) for row in (headings, *rows)) for number in range(len(headings))]
+    results_console(sum(widest) + 3 * len(widest)).print(table)

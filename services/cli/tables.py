@@ -14,9 +14,11 @@ _LOG_WIDTH = 140
 _VERDICT_STYLE = {"yes": "green", "doubtful": "yellow", "no": "red"}
 
 
-def results_console() -> Console:
+def results_console(table_width: int = 0) -> Console:
     """Standard output; a file or pipe is as wide as the widest table, so that nothing is cut off in a log."""
-    return Console(highlight=False) if sys.stdout.isatty() else Console(highlight=False, width=_LOG_WIDTH)
+    if sys.stdout.isatty():
+        return Console(highlight=False)
+    return Console(highlight=False, width=max(_LOG_WIDTH, table_width))
 
 
 def _quality(quality: Mapping[str, Any] | None) -> Text:

@@ -106,7 +106,7 @@ def trajectory_errors(
     path_length = float(np.linalg.norm(np.diff(true_centres, axis=0), axis=1).sum())
     moves = path_length > _MOVES and _spread(true_centres) > _MOVES
 
-    world = _mean_rotation(estimate, truth)
+    world = mean_rotation(estimate, truth)
     apart = np.einsum("nji,jk,nkl->nil", truth[:, :3, :3], world, estimate[:, :3, :3])
     rotation_rmse_deg = _rms(rotation_angle_deg(apart))
 
@@ -300,7 +300,7 @@ def align_centres(estimate: NDArray[np.float64], truth: NDArray[np.float64], *, 
     singular = np.linalg.svd((target - target.mean(0)).T @ (points - points.mean(0)), compute_uv=False)
     if singular[1] > 1e-10 * singular[0]:
         return umeyama(points, target, with_scale)
-    world = _mean_rotation(estimate, truth)
+    world = mean_rotation(estimate, truth)
     centred, centred_target = points - points.mean(0), target - target.mean(0)
     turned = centred @ world.T
     scale = 1.0
@@ -340,7 +340,7 @@ def _align_depth(
     return scale, shift
 
 
-def _mean_rotation(estimate: NDArray[np.float64], truth: NDArray[np.float64]) -> NDArray[np.float64]:
+def mean_rotation(estimate: NDArray[np.float64], truth: NDArray[np.float64]) -> NDArray[np.float64]:
     """The constant rotation of the world that makes the cameras of the two agree best."""
     return _nearest_rotation(np.einsum("nij,nkj->ik", truth[:, :3, :3], estimate[:, :3, :3]))
 

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vipe_core.errors import ConfigError
-from vipe_core.evaluation.metrics import align_centres, rotation_angle_deg
+from vipe_core.evaluation.metrics import align_centres, mean_rotation, rotation_angle_deg
 from vipe_core.evaluation.results import Paths
 from vipe_core.formats.atomic import complete_file
 
@@ -82,7 +82,10 @@ def _aligned(paths: Paths) -> tuple[Array, Array, Array, Array]:
         moved = estimate.copy()
         moved[:, :3, 3] += reference[:, :3, 3].mean(axis=0) - estimate[:, :3, 3].mean(axis=0)
     centres, true = moved[:, :3, 3], reference[:, :3, 3]
-    turned_deg = rotation_angle_deg(np.einsum("nji,njk->nik", reference[:, :3, :3], moved[:, :3, :3]))
+    # After the best constant rotation, as the metric: a straight path does not determine the roll of the alignment.
+    world = mean_rotation(estimate, reference)
+    turned = np.einsum("nji,jk,nkl->nil", reference[:, :3, :3], world, estimate[:, :3, :3])
+    turned_deg = rotation_angle_deg(turned)
     return centres, true, np.linalg.norm(centres - true, axis=1), turned_deg
 
 
@@ -107,7 +110,7 @@ def _path(
     middle = reference.mean(axis=0)
     flat = np.stack([(centres - middle) @ axis for axis in view], axis=1)
     true = np.stack([(reference - middle) @ axis for axis in view], axis=1)
-    axes.plot(true[:, 0], true[:, 1], "--", color=_REFERENCE, linewidth=1, label=names[1])
+    axes.plot(true[:, 0], true[:, 1], "--", color=_REFERENCE, linewidth=1, zorder=3, label=names[1])
     axes.plot(flat[:1, 0], flat[:1, 1], "o", color=_ESTIMATE, markersize=5, label=f"{names[0]} (dot: first frame)")
     lines = LineCollection(list(np.stack([flat[:-1], flat[1:]], axis=1)), cmap="viridis", linewidths=2)
     lines.set_array((apart[:-1] + apart[1:]) / 2)

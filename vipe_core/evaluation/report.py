@@ -25,12 +25,14 @@ _TERM_HEADINGS = {"dense_flow": "dense", "sparse_tracks": "sparse", "depth_prior
 
 @dataclass(frozen=True, slots=True)
 class Column:
-    """A figure in tables: `figure` of a row times `factor`, with `digits` after the point."""
+    """A figure in tables: `figure` of a row times `factor`, with `digits` after the point, or in all where it is a
+    length of any size (`significant`)."""
 
     figure: str
     heading: str
     digits: int
     factor: float = 1.0
+    significant: bool = False
 
 
 def columns(results: Sequence[SequenceResult], unit: tuple[str, float] = ("m", 1.0)) -> list[Column]:
@@ -41,9 +43,9 @@ def columns(results: Sequence[SequenceResult], unit: tuple[str, float] = ("m", 1
     """
     name, metres = unit
     possible = (
-        Column("ate_m", f"ATE [{name}]", 3, 1 / metres),
+        Column("ate_m", f"ATE [{name}]", 3, 1 / metres, True),
         Column("ate_percent", "ATE [% of path]", 3),
-        Column("rte_m", f"RTE [{name}]", 3, 1 / metres),
+        Column("rte_m", f"RTE [{name}]", 3, 1 / metres, True),
         Column("rre_deg", "RRE [deg]", 3),
         Column("rotation_deg", "rotation [deg]", 3),
         Column("fov_deg", "Focal [deg]", 2),
@@ -243,7 +245,9 @@ def _mean_row(name: str, results: Sequence[SequenceResult], shown: Sequence[Colu
 
 
 def _cell(value: float | None, column: Column) -> str:
-    return "-" if value is None else f"{value * column.factor:.{column.digits}f}"
+    if value is None:
+        return "-"
+    return f"{value * column.factor:.{column.digits}{'g' if column.significant else 'f'}}"
 
 
 def _markdown(headings: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
