@@ -220,7 +220,10 @@ def _run(task: Task) -> tuple[SequenceResult, Paths | None]:
     if sequence is not None:
         report, paths = _against_truth(annotation, sequence, task)
     shuttle = sampson = None
-    notes = () if sequence is None else sequence.notes
+    notes: tuple[str, ...] = () if sequence is None else sequence.notes
+    if annotation.quality.cuts:
+        at = ", ".join(str(frame) for frame in annotation.quality.cuts)
+        notes = (*notes, f"cuts at frames {at}: each shot has a path of its own, the whole one means little")
     if measure.consistency:
         if annotation.num_frames > 1:
             backward = annotator.annotate(ReversedView(source, annotation.timestamps_s))
