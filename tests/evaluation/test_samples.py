@@ -15,6 +15,7 @@ from vipe_core.evaluation import samples
 from vipe_core.evaluation.metrics import depth_errors, sample_depth
 from vipe_core.evaluation.picture import contact_sheet
 from vipe_core.evaluation.synthetic import render_frames, tiny_clip
+from vipe_core.evaluation.synthetic.crowd import CROWD_FPS, MAX_MOVING, MIN_MOVING, crowd, moving_share
 from vipe_core.evaluation.truth import evaluate_static_guess, read_truth
 
 KEYS = {"cam_to_world", "intrinsics", "camera", "depth", "depth_kind", "dynamic", "fps", "width", "height"}
@@ -47,6 +48,20 @@ def test_sample_files(tmp_path: Path, name: str) -> None:
     assert errors is not None
     assert errors.scale == pytest.approx(1.0, abs=1e-3)
     assert errors.delta125 > 0.97
+
+
+@pytest.mark.parametrize("seed", [0, 1, 4])
+def test_a_crowd_covers_what_is_announced_and_is_the_same_every_time(seed: int) -> None:
+    drawn = crowd(seed, 48)
+    assert MIN_MOVING < moving_share(drawn.scene, drawn.camera, drawn.world_from_cam) < MAX_MOVING
+    assert repr(crowd(seed, 48).scene) == repr(drawn.scene)
+    torsos = [body for body in drawn.scene.primitives if body.motion is not None]
+    for frame in (0, 24, 47):
+        eye = drawn.world_from_cam[frame, :3, 3]
+        for body in torsos:
+            assert body.motion is not None
+            at = np.array(body.centre) + body.motion.offset(frame / CROWD_FPS)
+            assert np.linalg.norm((at - eye)[:2]) > 0.6
 
 
 def test_the_demo_samples_are_as_announced() -> None:

@@ -65,18 +65,6 @@ def test_masks_apply_when_edges_are_read_and_the_measurement_stays() -> None:
     np.testing.assert_array_equal(graph[0, 1].weight, [[1, 1], [1, 1]])
 
 
-def test_area_votes_make_weak_texture_count_and_leave_no_measurement_at_zero() -> None:
-    graph = Graph()
-    raw = np.array([0.0, 0.03, 1.0, 4.0], dtype=np.float32)
-    np.testing.assert_array_equal(graph.weigh(raw), raw)
-    graph.area_votes = True
-    votes = graph.weigh(raw)
-    assert votes[0] == 0
-    assert votes[2] == pytest.approx(1.0)
-    assert votes[1] > 0.4
-    assert votes[3] < 1.1
-
-
 def test_loop_edges_keep_their_distance_from_each_other() -> None:
     pairs = [Pair(20, 3, 5.0), Pair(21, 3, 6.0), Pair(20, 4, 7.0), Pair(30, 3, 8.0)]
     chosen = loop_edges(pairs, Graph(), limit=10)

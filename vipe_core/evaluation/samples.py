@@ -17,6 +17,7 @@ import sys
 import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -25,6 +26,7 @@ from numpy.typing import NDArray
 from vipe_core.cameras import Camera
 from vipe_core.errors import ConfigError
 from vipe_core.evaluation import synthetic
+from vipe_core.evaluation.synthetic.crowd import CROWD_FPS, crowd
 from vipe_core.evaluation.synthetic.paths import arc, handheld, look_at, through
 from vipe_core.evaluation.synthetic.render import depth_kind_of, render_frames
 from vipe_core.evaluation.synthetic.scene import Scene
@@ -113,12 +115,20 @@ def _pano_room() -> Sample:
     return Sample(room_scene(), Camera("equirect", (), 768, 384), poses, seed=5)
 
 
+def _crowd(seed: int) -> Sample:
+    """People who cover 20 to 40 % of the picture, in a place and seen along a path that the seed draws."""
+    drawn = crowd(seed)
+    return Sample(drawn.scene, drawn.camera, drawn.world_from_cam, fps=CROWD_FPS, noise=1.5, seed=seed)
+
+
+_CROWD_SEEDS = range(5)
 _BUILDERS: dict[str, Callable[[], Sample]] = {
     "room_tour": _room_tour,
     "courtyard": _courtyard,
     "moving_ball": _moving_ball,
     "wide_room": _wide_room,
     "pano_room": _pano_room,
+    **{f"crowd_{seed}": partial(_crowd, seed) for seed in _CROWD_SEEDS},
 }
 SAMPLE_NAMES: tuple[str, ...] = tuple(_BUILDERS)
 DEMO_NAMES: tuple[str, ...] = ("room_tour", "courtyard", "moving_ball")

@@ -7,13 +7,12 @@ import math
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
 from numpy.typing import NDArray
 
 from vipe_core.ba.problem import Result
 from vipe_core.slam.adjustment import REFINE, Adjuster
 from vipe_core.slam.closing import LoopCloser
-from vipe_core.slam.masks import moving_cells
+from vipe_core.slam.masks import MotionMasks
 from vipe_core.slam.measuring import MeasuredGraph
 from vipe_core.slam.proximity import close_pairs, loop_edges
 from vipe_core.slam.reprojection import Reprojector
@@ -26,6 +25,8 @@ Array = NDArray[Any]
 _FOV_RANGE_DEG = (12.0, 150.0)
 # The adjustment has learnt something when it is this much surer than its prior.
 _OBSERVED_RATIO = 0.7
+# Share of a keyframe's cells whose change of mask calls for another adjustment.
+_VISIBLE_CHANGE = 0.02
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,6 +50,7 @@ class Backend:
         measured: MeasuredGraph,
         adjuster: Adjuster,
         reprojector: Reprojector,
+        masks: MotionMasks,
         settings: SlamSettings,
         working_width: int,
     ) -> None:
@@ -56,6 +58,7 @@ class Backend:
         self._keyframes = measured.keyframes
         self._adjuster = adjuster
         self._reprojector = reprojector
+        self._masks = masks
         self._settings = settings
         self._width = working_width
         self._closer = LoopCloser(measured, adjuster, reprojector)
@@ -68,13 +71,10 @@ class Backend:
         self._connect_loops()
         if self._closer.run():
             self._connect_loops()
-        self._mask_moving()
-        if self._measured.graph.area_votes:
-            # With large things moving, a free focal length helps them before they are masked.
-            self._adjust_everything(free_focal=False)
-            self._mask_moving()
+        everything = range(len(self._keyframes))
+        self._masks.update(everything)
         result = self._adjust()
-        if self._mask_moving():
+        if self._masks.update(everything) > _VISIBLE_CHANGE:
             result = self._adjust() or result
         self._keyframes.normalise_scale()
         return result
@@ -115,15 +115,3 @@ class Backend:
     def _adjust_everything(self, *, free_focal: bool) -> Result | None:
         frames = range(len(self._keyframes))
         return self._adjuster.adjust(self._keyframes, self._measured.graph, frames, (0,), REFINE, free_focal=free_focal)
-
-    def _mask_moving(self) -> bool:
-        """Refresh the motion masks; whether any keyframe's mask changed by a visible share of its cells."""
-        if not self._settings.terms.motion_masks:
-            return False
-        changed = 0.0
-        threshold_px = 2 * self._adjuster.robust_scale_px
-        for k in range(len(self._keyframes)):
-            static = ~moving_cells(self._reprojector, self._keyframes, self._measured.graph, k, threshold_px)
-            changed = max(changed, float(np.mean(static != self._keyframes.static(k))))
-            self._keyframes.set_static(k, static)
-        return changed > 0.02

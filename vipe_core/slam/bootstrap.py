@@ -1,8 +1,11 @@
 """The first keyframes: from measurements and a focal length to a map that tracking can extend.
 
-Dense adjustment from a flat scene can end in the wrong one of two reliefs that look almost alike (the depth reversal
-of a distant object). So several starts are tried on the same measurements, a flat one and the two-view geometry of the
-pairs with most parallax, and the lowest robust cost wins.
+A start is the two-view geometry of a pair with parallax, grown one keyframe at a time: its cells are triangulated, the
+next keyframe takes the pose that explains the largest area of them, and what it measures refines the depths. Nothing
+is adjusted before all keyframes stand, and area decides all the way (see `consensus.py`), so that a textured thing that
+moves cannot bend the beginning. The start that explains most is then adjusted with what moves masked.
+
+Where no pair has parallax, dense adjustment from a flat scene takes its place.
 """
 
 from __future__ import annotations
@@ -18,6 +21,8 @@ import poselib
 from numpy.typing import NDArray
 
 from vipe_core.slam.adjustment import FROM_SCRATCH, REFINE, TRACK, Adjuster, Step
+from vipe_core.slam.consensus import MIN_WEIGHT, consensus_pose, pinhole_camera
+from vipe_core.slam.masks import MotionMasks
 from vipe_core.slam.measuring import MeasuredGraph
 from vipe_core.slam.reprojection import Reprojector, splat_inverse_depth
 from vipe_core.slam.selection import Keyframe
@@ -31,13 +36,15 @@ POSE_ONLY = (Step("huber", 1.0, 8), Step("geman_mcclure", 2.0, 8), Step("geman_m
 
 _MAX_SEEDS = 3
 _MIN_POINTS = 50
-_MIN_WEIGHT = 0.1
-_MAX_POINTS = 600
+_MAX_POINTS = 1500
 _DEPTH_SPREAD = 20.0
-# Two starts that end this close have found the same minimum: no need to try more.
-_SAME_COST = 0.01
-# Share of the largest possible robust cost above which a start is not believed.
-_SUSPECT_COST = 0.1
+# Growth goes by the distance at which the robust kernel leaves a measurement half of its weight.
+_HALF_WEIGHT = math.sqrt(math.sqrt(2) - 1)
+# A start that explains most of the picture needs no rival.
+_CONVINCING = 0.5
+# Masks that change by less than this share of a keyframe's cells have settled; they do in a few rounds.
+_STABLE = 0.02
+_MAX_ROUNDS = 3
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,34 +54,51 @@ class Seed:
     Attributes:
         first: Becomes the origin.
         second: Its partner.
-        second_from_first: (4, 4), unit translation; None starts flat, without motion.
-        parallax: How much better two-view geometry explains the pair than a homography, 0..1.
+        second_from_first: (4, 4), unit translation.
+        parallax_px: Median displacement of what the pair explains beyond that of its rotation.
+        information: How well it determines the direction between the two, up to the noise of the matches: by the
+            square root of the number of cells and by the parallax. A narrow pair explains more of the picture, and
+            with it things that move.
     """
 
     first: int
     second: int
-    second_from_first: NDArray[np.float64] | None
-    parallax: float
+    second_from_first: NDArray[np.float64]
+    parallax_px: float
+    information: float
 
 
 @dataclass(frozen=True, slots=True)
 class _Start:
-    """A finished start: its robust cost as a share of the largest possible, and the map."""
+    """A finished start: the share of the measurements that it explains, and the map."""
 
-    cost: float
+    explained: float
     snapshot: tuple[Array, Array, Array]
 
 
 class Bootstrap:
-    """Builds the map of the first keyframes."""
+    """Builds the map of the first keyframes.
 
-    def __init__(self, measured: MeasuredGraph, adjuster: Adjuster, reprojector: Reprojector, neighbours: int) -> None:
+    Args:
+        neighbours: Previous keyframes that each one is matched with.
+    """
+
+    def __init__(
+        self,
+        measured: MeasuredGraph,
+        adjuster: Adjuster,
+        reprojector: Reprojector,
+        masks: MotionMasks,
+        neighbours: int,
+    ) -> None:
         self._measured = measured
         self._keyframes = measured.keyframes
         self._graph = measured.graph
         self._adjuster = adjuster
         self._reprojector = reprojector
+        self._masks = masks
         self._neighbours = neighbours
+        self._grow_px = _HALF_WEIGHT * masks.robust_scale_px
 
     def run(self, first: Sequence[Keyframe], times_s: Sequence[float]) -> None:
         """Fill the empty map with the keyframes `first`. One keyframe becomes the origin of a flat scene."""
@@ -88,95 +112,140 @@ class Bootstrap:
             self._keyframes.normalise_scale()
 
     def _start(self) -> None:
-        """Try starts until two agree; when even the best one contradicts much of the picture, let the area decide."""
+        """The start that explains the largest area, adjusted; or the flat one where that explains more."""
         blank = self._keyframes.snapshot()
-        seeds = self._seeds()
-        best = self._best_of(seeds[:_MAX_SEEDS], blank)
-        if best.cost > _SUSPECT_COST and len(seeds) > 0:
-            logger.debug("the best start costs %.3f: something large moves, or the geometry is hard", best.cost)
-            self._graph.area_votes = True
-            best = self._best_of(seeds, blank)
-        self._keyframes.restore(best.snapshot)
-
-    def _best_of(self, seeds: Sequence[Seed], blank: tuple[Array, Array, Array]) -> _Start:
-        best: _Start | None = None
-        for seed in [Seed(0, 1, None, 0.0), *seeds]:
+        grown: list[_Start] = []
+        for seed in self._seeds()[:_MAX_SEEDS]:
             self._keyframes.restore(blank)
-            cost = self._grow(seed)
-            logger.debug("start from %d-%d (parallax %.2f): cost %.4f", seed.first, seed.second, seed.parallax, cost)
-            same = best is not None and math.isfinite(cost) and abs(cost - best.cost) < _SAME_COST * cost
-            if best is None or cost < best.cost:
-                best = _Start(cost, self._keyframes.snapshot())
-            if same and cost < _SUSPECT_COST:
-                break
-        assert best is not None
-        return best
+            if self._grow(seed):
+                grown.append(_Start(self._explained(), self._keyframes.snapshot()))
+                logger.debug("start from %d-%d: explains %.4f", seed.first, seed.second, grown[-1].explained)
+        best: _Start | None = None
+        if grown:
+            best = max(grown, key=lambda start: start.explained)
+            self._keyframes.restore(best.snapshot)
+            self._adjust_masked()
+            best = _Start(self._explained(), self._keyframes.snapshot())
+            logger.debug("adjusted: explains %.4f", best.explained)
+        if best is None or best.explained < _CONVINCING:
+            masks = self._keyframes.statics()
+            self._keyframes.restore(blank)
+            for k in range(len(self._keyframes)):
+                self._keyframes.set_static(k, np.ones(self._keyframes.grid.num_cells, dtype=np.bool_))
+            if self._grow_flat():
+                flat = self._explained()
+                logger.debug("flat start: explains %.4f", flat)
+                if best is None or flat > best.explained:
+                    return
+            if best is not None:
+                self._keyframes.restore(best.snapshot)
+                for k in range(len(self._keyframes)):
+                    self._keyframes.set_static(k, masks[k])
 
     def _seeds(self) -> list[Seed]:
-        """The pairs with parallax, most first, from essential matrices at the initial focal length."""
+        """The pairs with parallax, the most telling first, from essential matrices at the initial focal length."""
         seeds = [self._two_view(i, j) for i, j in self._graph if i < j]
-        found = [seed for seed in seeds if seed is not None and seed.parallax > 0]
-        return sorted(found, key=lambda seed: (-seed.parallax, seed.first, seed.second))
+        found = [seed for seed in seeds if seed is not None and seed.parallax_px > self._grow_px]
+        return sorted(found, key=lambda seed: (-seed.information, seed.first, seed.second))
 
     def _two_view(self, i: int, j: int) -> Seed | None:
         match = self._graph[i, j]
-        kept = np.flatnonzero(match.weight.max(axis=1) > _MIN_WEIGHT)
+        kept = np.flatnonzero(match.weight.max(axis=1) > MIN_WEIGHT)
         if len(kept) < _MIN_POINTS:
             return None
         kept = kept[np.linspace(0, len(kept) - 1, min(len(kept), _MAX_POINTS)).astype(np.int64)]
         source = self._keyframes.grid.sample_px().numpy()[kept]
         target = match.target_px[kept].astype(np.float64)
-        fx, fy, cx, cy = (float(value) for value in self._keyframes.intrinsics)
-        camera = {
-            "model": "PINHOLE",
-            "width": int(self._keyframes.grid.width * self._keyframes.grid.stride),
-            "height": int(self._keyframes.grid.height * self._keyframes.grid.stride),
-            "params": [fx, fy, cx, cy],
+        camera = pinhole_camera(self._keyframes)
+        error_px = 0.5 * self._grow_px
+        ransac = {
+            "max_iterations": 500,
+            "min_iterations": 100,
+            "max_epipolar_error": error_px,
+            "seed": 0,
         }
-        ransac = {"max_iterations": 300, "max_epipolar_error": 1.0, "max_reproj_error": 1.0, "seed": 0}
         pose, report = poselib.estimate_relative_pose(source, target, camera, camera, ransac, {})
-        _, flat = poselib.estimate_homography(source, target, ransac, {})
         relative = np.eye(4)
         relative[:3, :3], relative[:3, 3] = pose.R, pose.t
         norm = float(np.linalg.norm(pose.t))
-        if not math.isfinite(norm) or norm < 1e-9 or not np.isfinite(relative).all():
+        inliers = np.asarray(report["inliers"], dtype=np.bool_)
+        if not math.isfinite(norm) or norm < 1e-9 or not np.isfinite(relative).all() or not inliers.any():
             return None
         relative[:3, 3] /= norm
-        parallax = float(report["inlier_ratio"]) * (1.0 - float(flat["inlier_ratio"]))
-        return Seed(i, j, relative, parallax)
+        turned = relative.copy()
+        turned[:3, 3] = 0
+        rotated = self._reprojector.induced(self._keyframes.intrinsics, turned, np.ones(len(kept)), kept).target_px
+        parallax_px = float(np.nanmedian(np.linalg.norm(target - rotated, axis=1)[inliers]))
+        return Seed(i, j, relative, parallax_px, parallax_px * math.sqrt(int(inliers.sum())))
 
-    def _grow(self, seed: Seed) -> float:
-        """Place the seed, then every other keyframe next to a placed one.
-
-        Returns:
-            The robust cost as a share of what it would be if nothing fitted: 0 is perfect, towards 1 is hopeless.
-        """
+    def _grow(self, seed: Seed) -> bool:
+        """Place the seed, then every other keyframe by the pose that explains most; whether all could be placed."""
         keyframes = self._keyframes
+        keyframes.set_pose(seed.second, seed.second_from_first)
         placed = [seed.first, seed.second]
-        if seed.second_from_first is not None:
-            keyframes.set_pose(seed.second, seed.second_from_first)
-            depth = self._triangulate(seed)
-            scale = float(np.median(depth))
-            keyframes.set_depth(seed.first, depth / scale)
-            relative = seed.second_from_first.copy()
-            relative[:3, 3] *= scale
-            keyframes.set_pose(seed.second, relative)
-            keyframes.set_depth(seed.second, splat_inverse_depth(self._reprojector, keyframes, seed.first, seed.second))
-        schedule = FROM_SCRATCH if seed.second_from_first is None else REFINE
-        self._adjuster.adjust(keyframes, self._graph, placed, (seed.first,), schedule)
+        usable = {k: self._take_depth(k, placed) for k in placed}
+        while len(placed) < len(keyframes):
+            best: tuple[float, int, Array] | None = None
+            for new in sorted(set(range(len(keyframes))) - set(placed)):
+                near = [k for k in placed if (k, new) in self._graph]
+                if not near:
+                    continue
+                views = [(k, self._graph[k, new]) for k in near]
+                found = consensus_pose(self._reprojector, keyframes, views, [usable[k] for k in near], self._grow_px)
+                if found is not None and (best is None or found[1] * len(near) > best[0]):
+                    best = (found[1] * len(near), new, found[0])
+            if best is None:
+                return False
+            keyframes.set_pose(best[1], best[2])
+            placed.append(best[1])
+            usable = {k: self._take_depth(k, placed) for k in placed}
+        return True
+
+    def _take_depth(self, k: int, placed: Sequence[int]) -> NDArray[np.bool_]:
+        """Give keyframe `k` the depths that the placed ones agree on, the median elsewhere; which cells have one."""
+        found = self._masks.agreement(k, placed)
+        if found is None:
+            return np.zeros(self._keyframes.grid.num_cells, dtype=np.bool_)
+        good = 2 * found.support(self._grow_px) > found.votes
+        median = float(np.median(found.inverse_depth[good])) if good.any() else 1.0
+        good &= (found.inverse_depth > median / _DEPTH_SPREAD) & (found.inverse_depth < median * _DEPTH_SPREAD)
+        self._keyframes.set_depth(k, np.where(good, found.inverse_depth, median))
+        return np.asarray(good, dtype=np.bool_)
+
+    def _explained(self) -> float:
+        """Share of all measurements that the map explains: by area, and whatever the masks say."""
+        explained = measured = 0
+        everything = range(len(self._keyframes))
+        for k in everything:
+            found = self._masks.agreement(k, everything)
+            if found is not None:
+                explained += int((found.error_px < self._grow_px).sum())
+                measured += int(found.measured.sum())
+        return explained / measured if measured else 0.0
+
+    def _adjust_masked(self) -> None:
+        """Mask what moves, adjust, and once more with the masks of the better poses."""
+        everything = range(len(self._keyframes))
+        self._masks.update(everything)
+        for _ in range(_MAX_ROUNDS):
+            self._adjuster.adjust(self._keyframes, self._graph, everything, (0,), REFINE)
+            if self._masks.update(everything) < _STABLE:
+                return
+
+    def _grow_flat(self) -> bool:
+        """Adjust keyframe after keyframe, from a flat scene without motion; whether all could be placed."""
+        keyframes = self._keyframes
+        placed = [0, 1]
+        self._adjuster.adjust(keyframes, self._graph, placed, (0,), FROM_SCRATCH)
         while len(placed) < len(keyframes):
             links = [(i, j) for i, j in self._graph if i in placed and j not in placed]
             if not links:
-                return math.inf
+                return False
             near, new = min(links, key=lambda edge: (abs(edge[0] - edge[1]), edge))
             self.place(near, new, [i for i, j in links if j == new])
-            placed.append(new)
-            placed.sort()
-            self._adjuster.adjust(keyframes, self._graph, placed, (seed.first,), TRACK)
-        result = self._adjuster.adjust(keyframes, self._graph, placed, (seed.first,), REFINE)
-        if result is None or result.weight_sum <= 0:
-            return math.inf
-        return result.cost / (result.weight_sum * self._adjuster.robust_scale_px**2)
+            placed = sorted([*placed, new])
+            self._adjuster.adjust(keyframes, self._graph, placed, (0,), TRACK)
+        return self._adjuster.adjust(keyframes, self._graph, placed, (0,), REFINE) is not None
 
     def place(self, near: int, new: int, neighbours: Sequence[int]) -> None:
         """Pose keyframe `new` against the depths of placed `neighbours`, and predict its depth from `near`."""
@@ -187,27 +256,3 @@ class Bootstrap:
             self._keyframes, self._graph, frames, tuple(neighbours), POSE_ONLY, edges=edges, free_depth=False
         )
         self._keyframes.set_depth(new, splat_inverse_depth(self._reprojector, self._keyframes, near, new))
-
-    def _triangulate(self, seed: Seed) -> NDArray[np.float64]:
-        """(P,) inverse depth of the first keyframe's cells, by least squares in the normalised second image.
-
-        With a = R ray and b = t the point a + b d is seen at (u, v) where a_x + b_x d = u (a_z + b_z d), and so for v:
-        two linear equations in d. Cells that come out behind a camera take the median.
-        """
-        assert seed.second_from_first is not None
-        match = self._graph[seed.first, seed.second]
-        fx, fy, cx, cy = self._keyframes.intrinsics
-        focal, centre = np.array([fx, fy]), np.array([cx, cy])
-        m = (self._keyframes.grid.sample_px().numpy() - centre) / focal
-        rays = np.concatenate([m, np.ones((len(m), 1))], axis=1) @ seed.second_from_first[:3, :3].T
-        t = seed.second_from_first[:3, 3]
-        seen = (match.target_px.astype(np.float64) - centre) / focal
-        offset = rays[:, :2] - seen * rays[:, 2:]
-        slope = t[:2] - seen * t[2]
-        depth = -(offset * slope).sum(axis=1) / np.maximum((slope * slope).sum(axis=1), 1e-12)
-        good = (depth > 0) & (match.weight.max(axis=1) > _MIN_WEIGHT)
-        if not good.any():
-            return np.ones(len(depth))
-        median = float(np.median(depth[good]))
-        inside = good & (depth > median / _DEPTH_SPREAD) & (depth < median * _DEPTH_SPREAD)
-        return np.where(inside, depth, median)

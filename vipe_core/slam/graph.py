@@ -20,8 +20,6 @@ from vipe_core.slam.keyframes import KeyframeMap
 
 Array = NDArray[Any]
 _AGREE_PX = 2.0
-# The raw weight that has half a vote.
-_HALF_VOTE = 0.03
 
 
 def fuse(dense: Match, sparse: Match) -> Match:
@@ -41,17 +39,11 @@ def fuse(dense: Match, sparse: Match) -> Match:
 
 
 class Graph:
-    """Directed measurements between numbered keyframes.
-
-    Attributes:
-        area_votes: Weigh cells by whether they are measured rather than by how much texture they have. Noisier, but
-            a textured thing that moves then counts by its area in the picture.
-    """
+    """Directed measurements between numbered keyframes."""
 
     def __init__(self) -> None:
         self._matches: dict[tuple[int, int], Match] = {}
         self._targets: dict[int, list[int]] = {}
-        self.area_votes = False
 
     def __len__(self) -> int:
         return len(self._matches)
@@ -85,12 +77,6 @@ class Graph:
         inside = set(frames)
         return [(i, j) for i in sorted(inside) for j in self._targets.get(i, ()) if j in inside]
 
-    def weigh(self, weight: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Raw weights of any shape as the adjustment is to see them; see `area_votes`."""
-        if not self.area_votes:
-            return weight
-        return np.asarray(weight * (1 + _HALF_VOTE) / (weight + _HALF_VOTE), dtype=np.float32)
-
     def read(
         self, edges: list[tuple[int, int]], number: Mapping[int, int], keyframes: KeyframeMap, device: torch.device
     ) -> Edges:
@@ -106,7 +92,6 @@ class Graph:
             match = self._matches[i, j]
             target_px[row] = match.target_px
             np.multiply(match.weight, keyframes.static(i)[:, None], out=weight[row])
-        weight = self.weigh(weight)
         return Edges(
             source=torch.tensor([number[i] for i, _ in edges], dtype=torch.int64, device=device),
             target=torch.tensor([number[j] for _, j in edges], dtype=torch.int64, device=device),

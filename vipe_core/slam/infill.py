@@ -137,9 +137,9 @@ class _ShotInfill:
         self.start, self.stop = shot_map.shot.start, shot_map.shot.stop
         self.moves = shot_map.motion != "static"
         self._keyframes = keyframes = shot_map.keyframes
-        self._graph = shot_map.graph
         self._adjuster = shot_map.adjuster
         self._fitter = shot_map.fitter
+        self._usable = shot_map.usable
         self._matcher = matcher
         self._reprojector = reprojector
         self._into = into
@@ -211,7 +211,7 @@ class _ShotInfill:
         number = {k: row for row, k in enumerate(sources)}
         first = len(sources)
         links = [
-            Link(number[k], first + row, match, self._keyframes.static(k))
+            Link(number[k], first + row, match, self._usable[k])
             for row, frame in enumerate(pending)
             for k, match in frame.matches
         ]
@@ -229,9 +229,7 @@ class _ShotInfill:
         first = len(sources)
         total = first + len(pending)
         links = [(number[k], first + row, match) for row, frame in enumerate(pending) for k, match in frame.matches]
-        weight = np.stack(
-            [self._graph.weigh(match.weight) * self._keyframes.static(sources[i])[:, None] for i, _, match in links]
-        )
+        weight = np.stack([match.weight * self._usable[sources[i]][:, None] for i, _, match in links])
         edges = Edges(
             source=torch.tensor([i for i, _, _ in links], dtype=torch.int64, device=device),
             target=torch.tensor([j for _, j, _ in links], dtype=torch.int64, device=device),
@@ -268,7 +266,7 @@ class _ShotInfill:
                 relative_pose(cam_from_world, self._keyframes.pose(k)),
                 self._keyframes.depth(k),
             )
-            weight = self._graph.weigh(match.weight).mean(axis=1) * self._keyframes.static(k)
+            weight = match.weight.mean(axis=1) * self._usable[k]
             weight = np.where(weight > _MIN_WEIGHT, weight, 0)
             error = np.linalg.norm(induced.target_px - match.target_px, axis=1)
             fits = (weight > 0) & (error < self._adjuster.robust_scale_px)

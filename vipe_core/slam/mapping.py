@@ -18,6 +18,7 @@ from vipe_core.slam.bootstrap import Bootstrap
 from vipe_core.slam.diagnostics import LoopReport, MapReport, examine, examine_loops
 from vipe_core.slam.graph import Graph
 from vipe_core.slam.keyframes import KeyframeMap
+from vipe_core.slam.masks import MotionMasks
 from vipe_core.slam.measuring import MeasuredGraph
 from vipe_core.slam.reprojection import Reprojector
 from vipe_core.slam.rotation import Link, RotationFitter
@@ -50,6 +51,7 @@ class ShotMap:
         loops: What its loop edges did.
         adjuster: Ran its adjustments.
         fitter: Fits rotations, where there is nothing else to fit.
+        usable: (K, P) bool, cells of each keyframe that are static and whose depth other views confirm.
     """
 
     shot: Shot
@@ -61,6 +63,7 @@ class ShotMap:
     loops: LoopReport
     adjuster: Adjuster
     fitter: RotationFitter | None
+    usable: NDArray[np.bool_]
 
 
 class ShotMapper:
@@ -111,14 +114,18 @@ class ShotMapper:
             reprojector,
             dense_flow=settings.terms.dense_flow,
         )
-        backend = Backend(measured, adjuster, reprojector, settings, size.width)
+        masks = MotionMasks(
+            reprojector, keyframes, graph, adjuster.robust_scale_px, enabled=settings.terms.motion_masks
+        )
+        backend = Backend(measured, adjuster, reprojector, masks, settings, size.width)
         static = shot.max_motion_px < settings.scaled_px(settings.static_motion_px, size.width)
         chosen = shot.keyframes[:1] if static else shot.keyframes
         times_s = [float(self._times_s[keyframe.index]) for keyframe in chosen]
-        tracker = Tracker(measured, adjuster, reprojector, settings, scale_px)
+        tracker = Tracker(measured, adjuster, reprojector, masks, settings, scale_px)
         with self._clock("track"):
             first = min(len(chosen), settings.min_keyframes)
-            Bootstrap(measured, adjuster, reprojector, settings.neighbours).run(chosen[:first], times_s[:first])
+            bootstrap = Bootstrap(measured, adjuster, reprojector, masks, settings.neighbours)
+            bootstrap.run(chosen[:first], times_s[:first])
             for done in range(first, len(chosen) + 1):
                 if done > first:
                     tracker.add(chosen[done - 1], times_s[done - 1])
@@ -140,7 +147,10 @@ class ShotMapper:
             if turned is not None:
                 motion, focal, fitter = "rotation", turned, candidate
                 found = examine(reprojector, keyframes, graph, adjuster.robust_scale_px)
-        return ShotMap(shot, keyframes, graph, motion, focal, found, loops, adjuster, fitter)
+        usable = keyframes.statics()
+        if motion == "general":
+            usable = np.stack([masks.reliable(k) for k in range(len(keyframes))])
+        return ShotMap(shot, keyframes, graph, motion, focal, found, loops, adjuster, fitter, usable)
 
     def _rotation_only(
         self, fitter: RotationFitter, keyframes: KeyframeMap, graph: Graph, prior: FocalPrior, found: MapReport

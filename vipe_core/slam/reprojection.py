@@ -56,6 +56,12 @@ class Reprojector:
         self._px = grid.sample_px()
         self._size = torch.tensor([grid.width * grid.stride - 1, grid.height * grid.stride - 1], dtype=torch.float64)
 
+    def rays(self, intrinsics: Array, px: Array | None = None) -> NDArray[np.float64]:
+        """(P, 3) rays of the cells, or of index coordinates `px` (P, 2)."""
+        params = torch.from_numpy(np.asarray(intrinsics, dtype=np.float64))
+        at = self._px if px is None else torch.from_numpy(np.asarray(px, dtype=np.float64))
+        return np.asarray(unproject(self._model, params, at).numpy())
+
     def induced(
         self, intrinsics: Array, target_from_source: Array, inverse_depth: Array, cells: Array | None = None
     ) -> Induced:

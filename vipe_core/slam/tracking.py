@@ -8,6 +8,8 @@ from numpy.typing import NDArray
 from vipe_core.geometry.arrays import interpolate_trajectory
 from vipe_core.slam.adjustment import TRACK, Adjuster
 from vipe_core.slam.bootstrap import POSE_ONLY
+from vipe_core.slam.consensus import consensus_pose
+from vipe_core.slam.masks import MotionMasks
 from vipe_core.slam.measuring import MeasuredGraph
 from vipe_core.slam.proximity import close_pairs
 from vipe_core.slam.reprojection import Reprojector, splat_inverse_depth
@@ -17,6 +19,8 @@ from vipe_core.slam.settings import SlamSettings
 _MAX_VELOCITY_RATIO = 1.5
 # Robust cost as a share of the largest possible below which a pose needs no second start.
 _GOOD_FIT = 0.1
+# Share of the picture that must agree on a pose.
+_MAJORITY = 0.5
 
 
 class Tracker:
@@ -27,6 +31,7 @@ class Tracker:
         measured: MeasuredGraph,
         adjuster: Adjuster,
         reprojector: Reprojector,
+        masks: MotionMasks,
         settings: SlamSettings,
         scale: float,
     ) -> None:
@@ -34,6 +39,7 @@ class Tracker:
         self._keyframes = measured.keyframes
         self._adjuster = adjuster
         self._reprojector = reprojector
+        self._masks = masks
         self._settings = settings
         self._near_px = 2 * settings.keyframe_motion_px * scale
 
@@ -44,12 +50,16 @@ class Tracker:
         self._keyframes.append(keyframe, time_s, start, self._keyframes.depth(k - 1))
         # The step to the previous keyframe is within the matcher's own reach, and the prediction may be wrong.
         self._measured.connect(k - 1, k, guided=False)
-        self._pose_from_previous(k)
+        if not self._pose_by_consensus(k):
+            self._pose_from_previous(k)
         self._keyframes.set_depth(k, splat_inverse_depth(self._reprojector, self._keyframes, k - 1, k))
         for i in range(max(0, k - self._settings.neighbours), k - 1):
             self._measured.connect(i, k, guided=True)
         self._connect_returning(k)
+        # What looks right from the step before may not from further away.
+        self._pose_by_consensus(k)
         oldest = max(0, k - self._settings.window + 1)
+        self._masks.update(range(max(oldest, k - self._settings.neighbours), k + 1))
         fixed = (oldest, oldest + 1) if oldest > 0 else (0,)
         self._adjuster.adjust(self._keyframes, self._measured.graph, range(oldest, k + 1), fixed, TRACK)
 
@@ -65,6 +75,21 @@ class Tracker:
             0
         ]
         return predicted
+
+    def _pose_by_consensus(self, k: int) -> bool:
+        """Give keyframe `k` the pose that most of the picture agrees on; False where no majority agrees on one."""
+        older = [i for i in self._measured.graph.targets(k) if i < k]
+        found = consensus_pose(
+            self._reprojector,
+            self._keyframes,
+            [(i, self._measured.graph[i, k]) for i in older],
+            [self._masks.reliable(i, k) for i in older],
+            self._masks.robust_scale_px,
+        )
+        if found is None or found[1] < _MAJORITY:
+            return False
+        self._keyframes.set_pose(k, found[0])
+        return True
 
     def _pose_from_previous(self, k: int) -> None:
         """Motion-only pose of the new keyframe against the depth of the one before.
