@@ -14,6 +14,7 @@ from vipe_core.ba.problem import (
     Status,
 )
 from vipe_core.ba.reprojection import reproject, residuals
+from vipe_core.ba.scale import largest_residual_px, residual_sigma_px, robust_scale_px
 from vipe_core.ba.solver import Step
 
 __all__ = [
@@ -28,8 +29,11 @@ __all__ = [
     "State",
     "Status",
     "Step",
+    "largest_residual_px",
     "newton_step",
     "reproject",
+    "residual_sigma_px",
     "residuals",
+    "robust_scale_px",
     "solve",
 ]

@@ -44,6 +44,7 @@ class HostSystem:
         pose: What the kernels need of the state.
         adjoint: (E, 6, 6) of target_from_source, edges in order.
         state: Where.
+        scale: (1,) squared scale of the robust kernel, px^2.
         cost: By-product of the linearisation.
     """
 
@@ -54,6 +55,7 @@ class HostSystem:
     pose: kernels.Pose
     adjoint: Array
     state: State
+    scale: Array
     cost: Cost
 
 
@@ -170,12 +172,9 @@ class HostSolver:
             for done in [pool.submit(work, begin, end) for begin, end in pairwise(bounds.tolist())]:
                 done.result()
 
-    def _scale(self) -> Array:
-        return np.full(1, self.options.robust_scale_px**2, self._numpy_dtype)
-
-    @property
-    def _numpy_dtype(self) -> np.dtype[Any]:
-        return self._graph.weight.dtype
+    def _number(self, value: float) -> Array:
+        """A scalar in the dtype of the pixels, as the kernels take it."""
+        return np.full(1, value, self._graph.weight.dtype)
 
     def _cost(self, sums: Array, state: State) -> Cost:
         measurements, weight, everything, prior = sums.sum(axis=0).tolist()
@@ -186,19 +185,19 @@ class HostSolver:
 
     # -- the solver's interface ------------------------------------------------------------------------------------
 
-    def cost(self, state: State) -> Cost:
+    def cost(self, state: State, scale_px: float) -> Cost:
         """The robust cost at a state."""
         pose, _ = self._pose(state)
-        sums, scale = np.zeros((len(self._depth_free), 4)), self._scale()
+        sums, scale = np.zeros((len(self._depth_free), 4)), self._number(scale_px**2)
         self._over_frames(
             lambda begin, end: kernels.evaluate(self._graph, pose, self._prior, self._kernel, scale, begin, end, sums)
         )
         return self._cost(sums, state)
 
-    def linearise(self, state: State) -> HostSystem:
+    def linearise(self, state: State, scale_px: float) -> HostSystem:
         """The normal equations at a state."""
         pose, transform = self._pose(state)
-        graph, structure, scale = self._graph, self._structure, self._scale()
+        graph, structure, scale = self._graph, self._structure, self._number(scale_px**2)
         sums = np.zeros((len(self._depth_free), 4))
         per_edge = np.zeros(kernels.ROWS**2 * len(self._source))
         per_frame = np.zeros(self._offset[-1])
@@ -256,6 +255,7 @@ class HostSolver:
             pose,
             adjoint,
             state,
+            scale,
             self._cost(sums, state),
         )
 
@@ -291,21 +291,19 @@ class HostSolver:
 
         depth = torch.zeros_like(state.inverse_depth)
         if factorised and self._depth_free.any():
-            twist = np.empty((len(self._source), 8), self._numpy_dtype)
+            twist = np.empty((len(self._source), 8), self._graph.weight.dtype)
             moved = (system.adjoint @ pose[self._source.numpy()][:, :, None])[:, :, 0]
             twist[:, :6] = pose[self._target.numpy()] - moved
             twist[:, 6], twist[:, 7] = log_focal, alpha
             gain = np.empty(len(self._depth_free))
-            damping_of = np.full(1, damping, self._numpy_dtype)
-            scale_px = self._scale()
-            out = depth.numpy()
+            damping_of, out = self._number(damping), depth.numpy()
             self._over_frames(
                 lambda begin, end: kernels.back_substitute(
                     self._graph,
                     system.pose,
                     self._prior,
                     self._kernel,
-                    scale_px,
+                    system.scale,
                     twist,
                     damping_of,
                     begin,

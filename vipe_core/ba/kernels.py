@@ -27,7 +27,7 @@ TILE = 256
 # Rows of an edge: 6 of its twist, log f, alpha, negative residual.
 ROWS = 9
 TAIL = 3
-ROBUST_CODE = {"none": 0, "huber": 1, "cauchy": 2, "geman_mcclure": 3}
+ROBUST_CODE = {"none": 0, "huber": 1, "cauchy": 2, "geman_mcclure": 3, "tukey": 4}
 
 # Rows of the view buffer: homogeneous point, 1 / s, projection before focal length and centre, |X|, weighted residual,
 # roots of the weights, argument of the robust kernel, larger weight. Zero weights where the point is not imaged.
@@ -139,9 +139,15 @@ def _rho_sum(kernel: int, c2: float, view: Array, n: int) -> tuple[float, float]
     elif kernel == 2:
         for p in range(n):
             total += weight[p] * c2 * math.log1p(squared[p] / c2)
-    else:
+    elif kernel == 3:
         for p in range(n):
             total += weight[p] * (squared[p] * c2 / (c2 + squared[p]))
+    else:
+        third, one = c2 / view.dtype.type(3), view.dtype.type(1)
+        for p in range(n):
+            inside = one - squared[p] / c2
+            inside = zero if inside < zero else inside
+            total += weight[p] * third * (one - inside * inside * inside)
     return total, kept
 
 
@@ -159,9 +165,13 @@ def _reweigh(kernel: int, c2: float, view: Array, n: int) -> None:
     elif kernel == 2:
         for p in range(n):
             squared[p] = one / math.sqrt(one + squared[p] / c2)
-    else:
+    elif kernel == 3:
         for p in range(n):
             squared[p] = c2 / (c2 + squared[p])
+    else:
+        for p in range(n):
+            inside = one - squared[p] / c2
+            squared[p] = view.dtype.type(0) if inside < view.dtype.type(0) else inside
     for p in range(n):
         root = view[_SQ + p]
         view[_EU + p] *= root

@@ -1,6 +1,8 @@
 """Levenberg-Marquardt over the normal equations: the entry points of bundle adjustment.
 
-The host reads one small tensor per step, to accept or reject it.
+Convergence is a predicate of the expected and the actual gain, computed where the numbers are. On a GPU the host reads
+it once per step, with everything else that it decides on; on a CPU, where reading is free, a state that is at its
+minimum already costs one linearisation.
 """
 
 from __future__ import annotations
@@ -16,6 +18,7 @@ from vipe_core.ba import robust
 from vipe_core.ba.host_solver import HostSolver
 from vipe_core.ba.problem import Edges, Options, Problem, Result, State, Status
 from vipe_core.ba.reprojection import require_supported
+from vipe_core.ba.scale import largest_residual_px
 from vipe_core.ba.solver import Cost, Solver, Step
 from vipe_core.ba.torch_solver import TorchSolver
 
@@ -28,6 +31,12 @@ _ACCEPTED_FACTOR = 0.2
 _REJECTED_FACTOR = 10.0
 # Mean squared residual, px^2, at which exact data is solved and only rounding is left.
 _NEGLIGIBLE_COST = 1e-14
+# A step that is not even tried must be expected to gain less than this share of what ends the solve after it was.
+_UNTRIED_SHARE = 0.1
+# ... and by a model that damping has not shortened much.
+_TRUSTED_DAMPING = 1e-2
+# Graduated non-convexity divides the squared scale by this at every step.
+_NARROWING = 1.4
 
 
 def solve(problem: Problem, state: State, options: Options | None = None) -> Result:
@@ -54,56 +63,99 @@ def solve(problem: Problem, state: State, options: Options | None = None) -> Res
     if not _finite(problem, state):
         return Result(state, Status.NON_FINITE, 0, math.nan, math.nan, 0.0)
     solver = _solver(problem, options, state)
-    cost = solver.cost(state)
-    measured, weight = _read(cost.measurements, cost.weight)
+    descent = _Descent(solver, options, state)
+    measured, weight = _read(descent.cost.measurements, descent.cost.weight)
     if not math.isfinite(measured):
         return Result(state, Status.NON_FINITE, 0, measured, measured, weight)
     if not solver.anything_free or not weight > 0:
         return Result(state, Status.EMPTY, 0, measured, measured, weight)
     initial_cost = measured
 
-    lost_rho = _lost_rho(options, cost)
-    total = cost.total(lost_rho)
-    system = solver.linearise(state)
-    linearised_state = state
-    damping, min_damping = options.initial_damping, _MIN_DAMPING[state.inverse_depth.dtype]
-    status = Status.MAX_ITERATIONS
-    iterations = 0
-    while iterations < options.max_iterations:
-        iterations += 1
-        step = solver.step(system, damping)
-        new_state = solver.retract(state, step)
-        new_cost = solver.cost(new_state)
-        new_total = new_cost.total(lost_rho)
-        old, new, predicted, factorised, mean = _read(
-            total, new_total, step.predicted_drop, step.factorised, new_total / new_cost.weight
-        )
-        if factorised and new < old:
-            state, cost, total = new_state, new_cost, new_total
-            damping = max(damping * _ACCEPTED_FACTOR, min_damping)
-            if old - new < options.relative_tolerance * old or mean < _NEGLIGIBLE_COST:
-                status = Status.CONVERGED
-                break
-            if iterations < options.max_iterations:
-                system, linearised_state = solver.linearise(state), state
-        else:
-            if factorised and predicted < options.relative_tolerance * old:
-                status = Status.CONVERGED
-                break
-            damping = max(damping * _REJECTED_FACTOR, min_damping)
-            if damping > _MAX_DAMPING:
-                status = Status.NO_PROGRESS if factorised else Status.SINGULAR
-                break
+    for scale_px in _wider_scales(problem, state, options):
+        descent.judge_at(scale_px)
+        descent.run(until_accepted=True)
+    descent.judge_at(options.robust_scale_px)
+    status = descent.run()
 
     variance = math.nan
     if solver.focal_free:
-        if linearised_state is not state:
-            system = solver.linearise(state)
-        variances = _read(*(solver.log_focal_variance(system, damping) for damping in _SIGMA_DAMPINGS))
+        variances = _read(*(solver.log_focal_variance(descent.system(), damping) for damping in _SIGMA_DAMPINGS))
         variance = next((value for value in variances if value > 0), math.nan)
-    measured, weight = _read(cost.measurements, cost.weight)
+    measured, weight = _read(descent.cost.measurements, descent.cost.weight)
     sigma = math.sqrt(variance) if variance > 0 else math.nan
-    return Result(state, status, iterations, initial_cost, measured, weight, sigma)
+    return Result(descent.state, status, descent.iterations, initial_cost, measured, weight, sigma)
+
+
+class _Descent:
+    """Levenberg-Marquardt steps from a state, each accepted only if it lowers the cost."""
+
+    def __init__(self, solver: Solver[Any], options: Options, state: State) -> None:
+        self.state = state
+        self.iterations = 0
+        self._solver = solver
+        self._options = options
+        self._on_host = state.inverse_depth.device.type == "cpu"
+        self._damping = options.initial_damping
+        self._min_damping = _MIN_DAMPING[state.inverse_depth.dtype]
+        self._scale_px = math.nan
+        self.judge_at(options.robust_scale_px)
+
+    def judge_at(self, scale_px: float) -> None:
+        """From here on, the robust kernel has this scale."""
+        if scale_px == self._scale_px:
+            return
+        self._scale_px = scale_px
+        self._system = self._solver.linearise(self.state, scale_px)
+        self._linearised = self.state
+        self.cost: Cost = self._system.cost
+        self._lost_rho = _lost_rho(self._options, scale_px, self.cost)
+
+    def system(self) -> Any:
+        """The normal equations at the state."""
+        if self._linearised is not self.state:
+            self._system = self._solver.linearise(self.state, self._scale_px)
+            self._linearised = self.state
+        return self._system
+
+    def run(self, *, until_accepted: bool = False) -> Status:
+        """Take steps until the cost does not fall any more, or up to the first that lowers it."""
+        while self.iterations < self._options.max_iterations:
+            before = self.state
+            status = self._try_step()
+            if status is not None:
+                return status
+            if until_accepted and self.state is not before:
+                break
+        return Status.MAX_ITERATIONS
+
+    def _try_step(self) -> Status | None:
+        options, solver, damping = self._options, self._solver, self._damping
+        step = solver.step(self.system(), damping)
+        total = self.cost.total(self._lost_rho)
+        enough = options.relative_tolerance * total
+        minimum = step.factorised & (step.predicted_drop < _UNTRIED_SHARE * enough) & (damping <= _TRUSTED_DAMPING)
+        if self._on_host and bool(minimum):
+            return Status.CONVERGED
+        self.iterations += 1
+        state = solver.retract(self.state, step)
+        cost = solver.cost(state, self._scale_px)
+        new_total = cost.total(self._lost_rho)
+        better = step.factorised & (new_total < total)
+        gain = torch.where(better, total - new_total, step.predicted_drop)
+        solved = step.factorised & (gain < enough) | better & (new_total < _NEGLIGIBLE_COST * cost.weight)
+        at_minimum, factorised, accepted, converged = _read(minimum, step.factorised, better, solved)
+        if at_minimum:
+            return Status.CONVERGED
+        if accepted:
+            self.state, self.cost = state, cost
+            self._damping = max(damping * _ACCEPTED_FACTOR, self._min_damping)
+        else:
+            self._damping = max(damping * _REJECTED_FACTOR, self._min_damping)
+        if converged:
+            return Status.CONVERGED
+        if self._damping > _MAX_DAMPING:
+            return Status.NO_PROGRESS if factorised else Status.SINGULAR
+        return None
 
 
 def newton_step(problem: Problem, state: State, options: Options | None = None, damping: float = 0.0) -> Step:
@@ -115,7 +167,25 @@ def newton_step(problem: Problem, state: State, options: Options | None = None, 
     options = options or Options()
     problem, state = _on_device(problem, state)
     solver = _solver(problem, options, state)
-    return solver.step(solver.linearise(state), damping)
+    return solver.step(solver.linearise(state, options.robust_scale_px), damping)
+
+
+def _wider_scales(problem: Problem, state: State, options: Options) -> list[float]:
+    """Scales of the robust kernel before the one asked for, narrowing.
+
+    Geman-McClure with squared scale mu c^2 is convex where s < mu c^2 / 3; Yang et al. 2020 begin at mu c^2 = 2 max s
+    and divide mu by 1.4. Here the steps are larger where more than half of the iterations would go into them.
+    """
+    final, first = options.robust_scale_px, options.initial_scale_px
+    if first is None or options.robust == "none":
+        return []
+    if math.isinf(first):
+        first = math.sqrt(2) * largest_residual_px(problem, state)
+    if first <= final:
+        return []
+    span = 2 * math.log(first / final)
+    levels = min(math.ceil(span / math.log(_NARROWING)), max(options.max_iterations // 2, 1))
+    return [final * math.exp(span / 2 * (levels - k) / levels) for k in range(levels)]
 
 
 def _solver(problem: Problem, options: Options, state: State) -> Solver[Any]:
@@ -152,11 +222,9 @@ def _finite(problem: Problem, state: State) -> bool:
     return bool(torch.stack(checks).all())
 
 
-def _lost_rho(options: Options, cost: Cost) -> Tensor:
+def _lost_rho(options: Options, scale_px: float, cost: Cost) -> Tensor:
     """What a measurement costs whose point is not in front of its camera: as much as a gross outlier, px^2."""
-    outlier = robust.cost(
-        options.robust, options.robust_scale_px, torch.full_like(cost.weight, (10 * options.robust_scale_px) ** 2)
-    )
+    outlier = robust.cost(options.robust, scale_px, torch.full_like(cost.weight, (10 * scale_px) ** 2))
     return torch.maximum(outlier, 4 * cost.measurements / cost.weight)
 
 

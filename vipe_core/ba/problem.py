@@ -21,7 +21,7 @@ from torch import Tensor
 
 from vipe_core.cameras import CameraModel
 
-RobustKernel = Literal["none", "huber", "cauchy", "geman_mcclure"]
+RobustKernel = Literal["none", "huber", "cauchy", "geman_mcclure", "tukey"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -145,9 +145,11 @@ class Options:
 
     Attributes:
         max_iterations: Upper bound of accepted plus rejected steps.
-        relative_tolerance: Stop when an accepted step lowers the cost by less than this share.
+        relative_tolerance: Stop when a step lowers the cost, or is expected to, by less than this share.
         robust: Kernel on the 2-norm of the residual in pixels.
         robust_scale_px: Its scale c.
+        initial_scale_px: Graduated non-convexity (Yang et al. 2020): the scale to begin with, which narrows to c as the
+            cost is lowered; infinity begins where a Geman-McClure kernel is convex over all residuals. None is c.
         initial_damping: First LM damping of the (scaled) reduced system.
         min_inverse_depth: Lower clamp of inverse depth after a step, relative to the median of the problem's.
         max_inverse_depth: Upper clamp, likewise.
@@ -158,6 +160,7 @@ class Options:
     relative_tolerance: float = 1e-4
     robust: RobustKernel = "geman_mcclure"
     robust_scale_px: float = 3.0
+    initial_scale_px: float | None = None
     initial_damping: float = 1e-4
     min_inverse_depth: float = 1e-3
     max_inverse_depth: float = 1e3
@@ -183,8 +186,8 @@ class Result:
         state: New state, same shapes and dtypes as the input.
         status: Why it ended.
         iterations: Steps tried.
-        initial_cost: Robust cost of the measurements before: sum of w rho(r^T W r / w), with w the larger of the two
-            weights of a measurement. Priors are not in it.
+        initial_cost: Robust cost of the measurements before: sum of w rho(r^T W r / w) at scale c, with w the larger of
+            the two weights of a measurement. Priors are not in it.
         cost: Robust cost after.
         weight_sum: Sum of these w over valid measurements at the end; `cost / weight_sum` is a mean squared residual,
             px^2.

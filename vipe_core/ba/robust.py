@@ -17,6 +17,8 @@ def cost(kernel: RobustKernel, scale_px: float, squared: Tensor) -> Tensor:
         return torch.where(squared <= c2, squared, 2 * scale_px * squared.sqrt() - c2)
     if kernel == "cauchy":
         return c2 * torch.log1p(squared / c2)
+    if kernel == "tukey":
+        return c2 / 3 * (1 - (1 - squared / c2).clamp_min(0) ** 3)
     return squared * (c2 / (c2 + squared))
 
 
@@ -32,4 +34,6 @@ def root_slope(kernel: RobustKernel, scale_px: float, squared: Tensor) -> Tensor
         return (c2 / squared.clamp_min(c2)).sqrt().sqrt()
     if kernel == "cauchy":
         return (squared / c2 + 1).rsqrt()
+    if kernel == "tukey":
+        return (1 - squared / c2).clamp_min(0)
     return (squared / c2 + 1).reciprocal()

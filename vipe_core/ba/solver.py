@@ -58,13 +58,21 @@ class Step:
     factorised: Tensor
 
 
-System = TypeVar("System")
+class Linearised(Protocol):
+    """The normal equations at a state, to be solved for any damping."""
+
+    @property
+    def cost(self) -> Cost:
+        """The robust cost there, a by-product."""
+
+
+System = TypeVar("System", bound=Linearised)
 
 
 class Solver(Protocol[System]):
     """Cost, linearisation and step of one problem; holds no state of the unknowns.
 
-    A `System` is the normal equations at a state, to be solved for any damping.
+    Scales are those of the robust kernel, px.
 
     Attributes:
         anything_free: Whether there is an unknown.
@@ -74,10 +82,10 @@ class Solver(Protocol[System]):
     anything_free: bool
     focal_free: bool
 
-    def cost(self, state: State) -> Cost:
+    def cost(self, state: State, scale_px: float) -> Cost:
         """The robust cost at a state."""
 
-    def linearise(self, state: State) -> System:
+    def linearise(self, state: State, scale_px: float) -> System:
         """The normal equations at a state."""
 
     def step(self, system: System, damping: float) -> Step:

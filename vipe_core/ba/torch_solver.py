@@ -105,11 +105,15 @@ class Linearisation:
     Attributes:
         direct: (n + 1, n + 1) float64 J^T J of poses and intrinsics, bordered by the negative gradient.
         eliminated: The same shape: what eliminating the undamped depths subtracts.
+        state: Where.
+        cost: By-product of the linearisation.
+        factors: Iterates over the chunks with free depths.
     """
 
     direct: Tensor
     eliminated: Tensor
     state: State
+    cost: Cost
     factors: Callable[[], Iterable[tuple[Chunk, _Eliminated]]]
 
 
@@ -189,26 +193,34 @@ class TorchSolver:
         squared = (weighted * weighted).sum(2).div_(measured.max_weight.clamp_min(torch.finfo(self.dtype).tiny))
         return _View(points, rotation, translation, s, norm, xy, valid, weighted, squared)
 
-    def cost(self, state: State) -> Cost:
+    def cost(self, state: State, scale_px: float) -> Cost:
         """The robust cost at a state."""
         geometry = self._geometry(state)
-        options = self.options
-        total = torch.zeros(4, dtype=torch.float64, device=self.device)
+        sums = torch.zeros(4, dtype=torch.float64, device=self.device)
         for index, chunk in enumerate(self.plan.chunks):
             measured = self._measure(index, chunk)
             view = self._view(chunk, measured, state, geometry)
-            rho = robust.cost(options.robust, options.robust_scale_px, view.squared)
-            kept_weight = measured.max_weight * view.valid
-            total[0] += (rho * kept_weight).sum(-1).double().sum()
-            total[1] += kept_weight.sum(-1).double().sum()
-            total[2] += measured.max_weight.sum(-1).double().sum()
-            prior = self._depth_prior(chunk, state)
-            if chunk.depth_free and prior is not None:
-                total[3] += (prior[0] * prior[1] * prior[1]).sum(-1).double().sum()
-        priors = self.problem.priors
-        if priors.log_focal is not None and self.plan.focal_column is not None:
-            total[3] += ((state.intrinsics[0].log() - priors.log_focal) / priors.log_focal_sigma) ** 2
-        return Cost(total[0], total[1], total[2] - total[1], total[3])
+            self._add_cost(sums, chunk, measured, view, state, scale_px)
+        return self._cost(sums, state)
+
+    def _add_cost(
+        self, sums: Tensor, chunk: Chunk, measured: _Measured, view: _View, state: State, scale_px: float
+    ) -> None:
+        """Add robust cost, valid weight, all weight and depth prior of a chunk to `sums` (4,)."""
+        kept_weight = measured.max_weight * view.valid
+        rho = robust.cost(self.options.robust, scale_px, view.squared)
+        sums[0] += (rho * kept_weight).sum(-1).double().sum()
+        sums[1] += kept_weight.sum(-1).double().sum()
+        sums[2] += measured.max_weight.sum(-1).double().sum()
+        prior = self._depth_prior(chunk, state)
+        if chunk.depth_free and prior is not None:
+            sums[3] += (prior[0] * prior[1] * prior[1]).sum(-1).double().sum()
+
+    def _cost(self, sums: Tensor, state: State) -> Cost:
+        priors, prior_cost = self.problem.priors, sums[3]
+        if priors.log_focal is not None and self.focal_free:
+            prior_cost = prior_cost + ((state.intrinsics[0].log() - priors.log_focal) / priors.log_focal_sigma) ** 2
+        return Cost(sums[0], sums[1], sums[2] - sums[1], prior_cost)
 
     def _depth_prior(self, chunk: Chunk, state: State) -> tuple[Tensor, Tensor] | None:
         """Information (F, P) and prior minus state (F, P)."""
@@ -222,7 +234,7 @@ class TorchSolver:
     # -- normal equations ----------------------------------------------------------------------------------------
 
     def _rows(
-        self, chunk: Chunk, view: _View, measured: _Measured, state: State, geometry: _Geometry
+        self, chunk: Chunk, view: _View, measured: _Measured, state: State, geometry: _Geometry, scale_px: float
     ) -> tuple[Tensor, Tensor]:
         """Scaled Jacobian rows of tau and intrinsics, then the negative residual; and the scaled J_X.
 
@@ -231,7 +243,7 @@ class TorchSolver:
         """
         scale = measured.root_weight * view.valid[:, :, None]
         residual = view.weighted
-        slope = robust.root_slope(self.options.robust, self.options.robust_scale_px, view.squared)
+        slope = robust.root_slope(self.options.robust, scale_px, view.squared)
         if slope is not None:
             scale = scale * slope[:, :, None]
             residual = residual * slope[:, :, None]
@@ -295,7 +307,7 @@ class TorchSolver:
         x.mul_(root_q[:, None])
         return _Eliminated(x, root_q, geometry.adjoint[chunk.edges])
 
-    def linearise(self, state: State) -> Linearisation:
+    def linearise(self, state: State, scale_px: float) -> Linearisation:
         """The normal equations at a state."""
         geometry = self._geometry(state)
         size = self.plan.num_columns + 2
@@ -303,13 +315,16 @@ class TorchSolver:
         eliminated = torch.zeros_like(direct)
         kept: list[tuple[Chunk, _Eliminated]] = []
 
-        def rows_of(index: int, chunk: Chunk) -> tuple[Tensor, Tensor]:
+        sums = torch.zeros(4, dtype=torch.float64, device=self.device)
+
+        def seen(index: int, chunk: Chunk) -> tuple[_Measured, _View]:
             measured = self._measure(index, chunk)
-            view = self._view(chunk, measured, state, geometry)
-            return self._rows(chunk, view, measured, state, geometry)
+            return measured, self._view(chunk, measured, state, geometry)
 
         for index, chunk in enumerate(self.plan.chunks):
-            rows, by_point = rows_of(index, chunk)
+            measured, view = seen(index, chunk)
+            self._add_cost(sums, chunk, measured, view, state, scale_px)
+            rows, by_point = self._rows(chunk, view, measured, state, geometry, scale_px)
             flat = rows.flatten(3)
             adjoint = geometry.adjoint[chunk.edges]
             _scatter(direct, chunk, _border(flat @ flat.mT), adjoint)
@@ -325,7 +340,9 @@ class TorchSolver:
                 return
             for index, chunk in enumerate(self.plan.chunks):
                 if chunk.depth_free:
-                    yield chunk, self._eliminate(chunk, *rows_of(index, chunk), geometry, state)
+                    measured, view = seen(index, chunk)
+                    rows, by_point = self._rows(chunk, view, measured, state, geometry, scale_px)
+                    yield chunk, self._eliminate(chunk, rows, by_point, geometry, state)
 
         priors, column = self.problem.priors, self.plan.focal_column
         if priors.log_focal is not None and column is not None:
@@ -334,7 +351,7 @@ class TorchSolver:
             direct[column, column] += information
             direct[column, -2] += pull
             direct[-2, column] += pull
-        return Linearisation(direct[:-1, :-1], eliminated[:-1, :-1], state, factors)
+        return Linearisation(direct[:-1, :-1], eliminated[:-1, :-1], state, self._cost(sums, state), factors)
 
     # -- solution ------------------------------------------------------------------------------------------------
 
