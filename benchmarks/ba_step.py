@@ -5,8 +5,8 @@
 First a window of 80 edges with 4800 cells each: CPU milliseconds per Levenberg-Marquardt step (linearisation, reduced
 system, step of the depths, cost) and per cost evaluation. Then trajectories with 6 edges per keyframe, every tenth
 keyframe also tied to one far away, a fresh process for each: CPU seconds per step, the share of the reduced system in
-it, and peak memory above what was resident with the measurements loaded. The torch solver, whose reduced system is dense, runs
-where its matrices of (6 N)^2 stay below 2 GiB.
+it, and peak memory above what was resident with the measurements loaded. The torch solver, whose reduced system is
+dense, runs where its matrices of (6 N)^2 stay below 2 GiB.
 """
 
 from __future__ import annotations

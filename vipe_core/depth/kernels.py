@@ -9,28 +9,21 @@ Numba's cache notices changes of the file of a function only, so what calls each
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from vipe_core.compilation import compiled
+
 Array = NDArray[Any]
-F = TypeVar("F", bound=Callable[..., object])
 
 MODEL_CODE = {"pinhole": 0, "mei": 1, "equirect": 2}
 
 _FAR_COST = 1.0
 
 
-def _compiled(function: F) -> F:
-    """Without parallel loops or reordered arithmetic: the same bytes on every run. Releases the GIL."""
-    result: F = njit(cache=True, nogil=True, error_model="numpy", fastmath=False)(function)
-    return result
-
-
-@_compiled
+@compiled
 def _project(model: int, params: Array, x: float, y: float, z: float) -> tuple[float, float, float]:
     """Index coordinates of a direction, and the length that its inverse depth is divided by (0: not imaged)."""
     if model == 0:
@@ -49,7 +42,7 @@ def _project(model: int, params: Array, x: float, y: float, z: float) -> tuple[f
     return u, v, norm
 
 
-@_compiled
+@compiled
 def _window_statistics(image: Array, radius: int) -> tuple[Array, Array]:
     """Mean and variance of the clipped box around every pixel."""
     h, w = image.shape
@@ -68,7 +61,7 @@ def _window_statistics(image: Array, radius: int) -> tuple[Array, Array]:
     return mean, variance
 
 
-@_compiled
+@compiled
 def _warp_pinhole(
     image: Array, turned: Array, t: Array, base: Array, offset: float, params: Array, warped: Array, seen: Array
 ) -> None:
@@ -98,7 +91,7 @@ def _warp_pinhole(
             seen[y, x] = zero
 
 
-@_compiled
+@compiled
 def _warp(
     image: Array,
     turned: Array,
@@ -130,7 +123,7 @@ def _warp(
                 seen[y, x] = 0
 
 
-@_compiled
+@compiled
 def _correlate(
     reference: Array,
     mean: Array,
@@ -196,7 +189,7 @@ def _correlate(
             count[y, x] += np.uint8(whole)
 
 
-@_compiled
+@compiled
 def sweep_cost(
     reference: Array,
     rays: Array,
@@ -269,7 +262,7 @@ def sweep_cost(
     return cost
 
 
-@_compiled
+@compiled
 def add_prior(cost: Array, position: Array, confidence: Array, gain: float, reach: float) -> None:
     """Adds a truncated cost of leaving plane `position` (h, w), in place; `confidence` (h, w) scales it."""
     h, w, num_planes = cost.shape
@@ -282,7 +275,7 @@ def add_prior(cost: Array, position: Array, confidence: Array, gain: float, reac
                     cost[y, x, k] += scale * np.float32(min(1.0, away))
 
 
-@_compiled
+@compiled
 def _pass(
     cost: Array, gray: Array, total: Array, small: float, large: float, edge: float, vertical: bool, backward: bool
 ) -> None:
@@ -318,7 +311,7 @@ def _pass(
             lowest, last_gray = smallest, value
 
 
-@_compiled
+@compiled
 def aggregate(cost: Array, gray: Array, small: float, large: float, edge: float) -> Array:
     """Semi-global aggregation along four directions (Hirschmueller 2008, equation 13): (h, w, D) float32."""
     total = np.zeros_like(cost)
@@ -329,7 +322,7 @@ def aggregate(cost: Array, gray: Array, small: float, large: float, edge: float)
     return total
 
 
-@_compiled
+@compiled
 def winner(total: Array, cost: Array) -> tuple[Array, Array]:
     """Position of the lowest aggregated cost with a parabola through its neighbours, and the raw cost there."""
     h, w, n = total.shape
@@ -351,7 +344,7 @@ def winner(total: Array, cost: Array) -> tuple[Array, Array]:
     return position, raw
 
 
-@_compiled
+@compiled
 def check(
     inverse_depth: Array,
     rays: Array,
@@ -390,7 +383,7 @@ def check(
                 ratios[y, x] += ratio
 
 
-@_compiled
+@compiled
 def upsample(
     inverse_depth: Array, confidence: Array, gray: Array, full_gray: Array, edge: float, same: float
 ) -> tuple[Array, Array]:

@@ -11,7 +11,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from vipe_core.evaluation.synthetic.compiled import compiled
+from vipe_core.compilation import compiled
 
 _EPS = 1e-9
 

@@ -13,7 +13,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from vipe_core.evaluation.synthetic.compiled import compiled
+from vipe_core.compilation import compiled
 
 _OCTAVES = 11
 _PERSISTENCE = 0.86
