@@ -227,13 +227,15 @@ def _run(
 
 def _show(title: str, headings: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
     from rich.table import Table
+    from rich.text import Text
 
     from services.cli.tables import results_console
 
-    table = Table(title=title, show_edge=False, pad_edge=False, header_style="bold")
+    table = Table(title=Text(title), show_edge=False, pad_edge=False, header_style="bold")
     for number, heading in enumerate(headings):
-        table.add_column(heading, justify="left" if number == 0 else "right")
+        # As text: [m] is a unit, not markup.
+        table.add_column(Text(heading), justify="left" if number == 0 else "right")
     for row in rows:
-        table.add_row(*row)
+        table.add_row(*map(Text, row))
     widest = [max(len(row[number]) for row in (headings, *rows)) for number in range(len(headings))]
     results_console(sum(widest) + 3 * len(widest)).print(table)

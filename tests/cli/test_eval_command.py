@@ -32,6 +32,7 @@ def test_a_folder_of_videos_becomes_a_report(vipectl: Run, clip: Path, tmp_path:
     assert "![walk.mp4](figures/walk.png)" in text
     assert (tmp_path / "report" / "figures" / "walk.png").stat().st_size > 5000
     assert "walk.mp4" in done.stdout
+    assert "Sampson [px]" in done.stdout
     assert "SIFT" in text
 
     before = (tmp_path / "report" / "report.json").read_bytes()
