@@ -11,6 +11,7 @@ import pytest
 from benchmarks.peers.colmap import ColmapSettings, run_colmap
 from benchmarks.sequences import SUITE, find_sequence
 from vipe_core.errors import MediaNotFound
+from vipe_core.evaluation.samples import SAMPLE_NAMES
 from vipe_core.evaluation.truth import read_truth
 
 
@@ -45,7 +46,7 @@ def test_a_run_is_killed_at_its_time_limit(pictures: Path) -> None:
 
 
 def test_every_sequence_that_something_is_asked_of_is_found(shared_data: Path) -> None:
-    for name in SUITE:
+    for name in set(SUITE) - set(SAMPLE_NAMES):  # samples are rendered when they are asked for
         sequence = find_sequence(name, shared_data)
         assert sequence.video.exists()
         assert len(read_truth(sequence.truth).world_from_cam) > 1
