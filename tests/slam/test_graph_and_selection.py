@@ -17,7 +17,7 @@ from vipe_core.cameras import Camera
 from vipe_core.errors import EmptyMedia
 from vipe_core.priors.protocols import Match, WorkingFrame
 from vipe_core.slam.frames import EncodedFrames
-from vipe_core.slam.graph import Graph, fuse
+from vipe_core.slam.graph import Graph, fuse, sharpen
 from vipe_core.slam.keyframes import KeyframeMap
 from vipe_core.slam.proximity import Pair, loop_edges
 from vipe_core.slam.selection import Keyframe, Selection, select_keyframes
@@ -50,6 +50,14 @@ def test_a_track_that_contradicts_the_flow_is_left_out_and_one_without_flow_is_t
     fused = fuse(dense, sparse)
     np.testing.assert_allclose(fused.target_px, [[10.0, 20.0], [60.0, 60.0]])
     np.testing.assert_allclose(fused.weight, [[1.0, 1.0], [4.0, 4.0]])
+
+
+def test_an_alignment_replaces_flow_it_agrees_with_and_flow_stays_where_they_contradict() -> None:
+    flow = match([[10.0, 20.0], [50.0, 50.0], [70.0, 70.0], [0.0, 0.0]], [[1, 1], [1, 1], [1, 1], [0, 0]])
+    aligned = match([[10.5, 20.0], [53.0, 50.0], [70.1, 70.0], [30.0, 30.0]], [[4, 3], [4, 4], [0.5, 0.5], [2, 2]])
+    sharp = sharpen(flow, aligned)
+    np.testing.assert_allclose(sharp.target_px, [[10.5, 20.0], [50.0, 50.0], [70.0, 70.0], [30.0, 30.0]])
+    np.testing.assert_allclose(sharp.weight, [[4, 3], [1, 1], [1, 1], [2, 2]])
 
 
 def test_masks_apply_when_edges_are_read_and_the_measurement_stays() -> None:

@@ -84,6 +84,21 @@ class SparseTracker(Protocol):
         """Measurements at the cells that hold a track; weight 0 elsewhere. `dense` guides the search."""
 
 
+class Aligner(Protocol):
+    """Measurements of the last digit, once the geometry is known to a few pixels (paper: the recurrent update)."""
+
+    def align(self, source: Any, target: Any, guess_px: Array) -> Match:
+        """One-way measurement, each cell by itself.
+
+        Args:
+            guess_px: (P, 2) where the current estimate sees the source cells in the target, right to a few pixels; NaN
+                where they are not to be looked for. Its local derivative tells how the picture is distorted.
+
+        Returns:
+            `consistent` is the share of the textured cells with a guess that were aligned.
+        """
+
+
 @dataclass(frozen=True, slots=True)
 class Correspondences:
     """The same points in two frames, verified by epipolar geometry; a few may still be wrong.
@@ -148,9 +163,11 @@ class PriorFamily:
         tracker: Sparse tracks, or None for a family whose dense matching needs none.
         points: Correspondences across wide steps, or None for a family whose dense matching needs none.
         intrinsics: Initial camera.
+        aligner: Measurements near the finished geometry, or None for a family whose dense matching is as good.
     """
 
     matcher: DenseMatcher
     tracker: SparseTracker | None
     points: PointMatcher | None
     intrinsics: IntrinsicsInit
+    aligner: Aligner | None = None

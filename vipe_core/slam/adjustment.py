@@ -54,6 +54,9 @@ TRACK = (Step("geman_mcclure", 4.0, 4), Step("geman_mcclure", 1.0, 4))
 REFINE = (Step("geman_mcclure", 4.0, 10), Step("geman_mcclure", 1.0, 15))
 """Everything is near its place."""
 
+SETTLE = (Step("geman_mcclure", 1.0, 15),)
+"""Everything is in its place but for the last digit."""
+
 
 @dataclass(frozen=True, slots=True)
 class FocalPrior:

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import logging
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 from numpy.typing import NDArray
 
 from vipe_core.ba.problem import Result
-from vipe_core.slam.adjustment import REFINE, Adjuster
+from vipe_core.slam.adjustment import REFINE, SETTLE, Adjuster, Step
 from vipe_core.slam.closing import LoopCloser
 from vipe_core.slam.masks import MotionMasks
 from vipe_core.slam.measuring import MeasuredGraph
@@ -27,6 +29,9 @@ _FOV_RANGE_DEG = (12.0, 150.0)
 _OBSERVED_RATIO = 0.7
 # Share of a keyframe's cells whose change of mask calls for another adjustment.
 _VISIBLE_CHANGE = 0.02
+# The second sharpening starts from depths that know the distortion of the patches better.
+_SHARPENINGS = 2
+_SUBSAMPLE = 4
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,6 +84,35 @@ class Backend:
         self._keyframes.normalise_scale()
         return result
 
+    def sharpen(self) -> Result | None:
+        """Measure every edge again from the adjusted geometry, and keyframes farther apart; adjust; twice.
+
+        Steps between neighbours add up like a random walk. Edges over several keyframes hold the sum.
+        The motion masks stay: alignments start from where the cells would be if nothing moved.
+        """
+        if len(self._keyframes) < 2 or not self._measured.can_sharpen:
+            return None
+        result: Result | None = None
+        for _ in range(_SHARPENINGS):
+            edges = sorted({*self._measured.graph, *self._wide_edges()})
+            for i, j in edges:
+                self._measured.sharpen(i, j, self._settings.min_consistent)
+            result = self._adjust(SETTLE)
+        self._keyframes.normalise_scale()
+        return result
+
+    def _wide_edges(self) -> list[tuple[int, int]]:
+        """Both directions between each keyframe and those a few steps on, as far as they see the same."""
+        count = len(self._keyframes)
+        pairs = [(i, i + step) for step in self._settings.wide_steps for i in range(count - step)]
+        if not pairs:
+            return []
+        first, last = [i for i, _ in pairs], [j for _, j in pairs]
+        there = self._reprojector.fan(self._keyframes, first, last, _SUBSAMPLE)
+        back = self._reprojector.fan(self._keyframes, last, first, _SUBSAMPLE)
+        seen = np.minimum(there.overlap, back.overlap) >= self._settings.wide_overlap
+        return [edge for (i, j), keep in zip(pairs, seen, strict=True) if keep for edge in ((i, j), (j, i))]
+
     def _connect_loops(self) -> None:
         count = len(self._keyframes)
         limit = max(1, round(self._settings.loop_edges_per_keyframe * count))
@@ -95,10 +129,10 @@ class Backend:
         for pair in loop_edges(pairs, self._measured.graph, limit - existing):
             self._measured.connect(pair.target, pair.source, guided=True, min_consistent=self._settings.min_consistent)
 
-    def _adjust(self) -> Result | None:
+    def _adjust(self, schedule: Sequence[Step] = REFINE) -> Result | None:
         """Adjust with a free focal length under its prior; take it back when it runs out of any lens's range."""
         before = self._keyframes.snapshot()
-        result = self._adjust_everything(free_focal=True)
+        result = self._adjust_everything(schedule, free_focal=True)
         if result is None:
             return None
         prior_sigma = self._adjuster.focal_prior.sigma
@@ -110,8 +144,10 @@ class Backend:
         logger.info("focal length held: it went to a field of view of %.1f deg, sigma %.3f", fov_deg, sigma)
         self.focal = FocalReport(prior_sigma, observed=False)
         self._keyframes.restore(before)
-        return self._adjust_everything(free_focal=False)
+        return self._adjust_everything(schedule, free_focal=False)
 
-    def _adjust_everything(self, *, free_focal: bool) -> Result | None:
+    def _adjust_everything(self, schedule: Sequence[Step], *, free_focal: bool) -> Result | None:
         frames = range(len(self._keyframes))
-        return self._adjuster.adjust(self._keyframes, self._measured.graph, frames, (0,), REFINE, free_focal=free_focal)
+        return self._adjuster.adjust(
+            self._keyframes, self._measured.graph, frames, (0,), schedule, free_focal=free_focal
+        )

@@ -38,6 +38,22 @@ def fuse(dense: Match, sparse: Match) -> Match:
     return Match(target_px.astype(np.float32), weight.astype(np.float32), dense.consistent)
 
 
+def sharpen(measured: Match, aligned: Match) -> Match:
+    """`measured` with the alignments in their place where they are at least as sure.
+
+    An alignment started from the geometry and flow that did not: where the two disagree by more than `_AGREE_PX`,
+    something moves or is hidden, and flow stays to say so.
+    """
+    apart = np.linalg.norm(aligned.target_px - measured.target_px, axis=1) > _AGREE_PX
+    apart &= measured.weight.any(axis=1)
+    better = ~apart & (aligned.weight.max(axis=1) > measured.weight.max(axis=1))
+    return Match(
+        np.where(better[:, None], aligned.target_px, measured.target_px),
+        np.where(better[:, None], aligned.weight, measured.weight),
+        measured.consistent,
+    )
+
+
 class Graph:
     """Directed measurements between numbered keyframes."""
 

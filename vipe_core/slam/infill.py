@@ -14,11 +14,12 @@ from numpy.typing import NDArray
 
 from vipe_core.ba.problem import Edges, Free, Problem, State
 from vipe_core.geometry.arrays import interpolate_trajectory
-from vipe_core.priors.protocols import DenseMatcher, Match, SparseTracker
-from vipe_core.slam.adjustment import Step
+from vipe_core.priors.protocols import Aligner, DenseMatcher, Match, SparseTracker
+from vipe_core.slam.adjustment import SETTLE, Step
 from vipe_core.slam.frames import EncodedFrames
+from vipe_core.slam.graph import sharpen
 from vipe_core.slam.mapping import ShotMap
-from vipe_core.slam.reprojection import Reprojector, relative_pose
+from vipe_core.slam.reprojection import Induced, Reprojector, relative_pose
 from vipe_core.slam.rotation import Link, RotationFitter
 from vipe_core.slam.selection import Report
 
@@ -52,9 +53,10 @@ class Trajectory:
 
 @dataclass(frozen=True, slots=True)
 class _Pending:
-    """A frame that waits for its batch: its number, its start, and its measurements from keyframes."""
+    """A frame that waits for its batch: its number, its features, its start, and its measurements from keyframes."""
 
     index: int
+    features: Any
     start: NDArray[np.float64]
     matches: tuple[tuple[int, Match], ...]
 
@@ -75,6 +77,7 @@ def fill_in(
     reprojector: Reprojector,
     batch: int,
     report: Report,
+    aligner: Aligner | None = None,
     tracks_only: SparseTracker | None = None,
 ) -> Trajectory:
     """Pose every frame of the video against the finished map of its shot; holds one batch of measurements at a time.
@@ -83,6 +86,7 @@ def fill_in(
         maps: Of the shots, in the order of the video.
         placed: (N,) bool; frames that are False keep their interpolated pose.
         batch: Frames that are posed together.
+        aligner: Sharpens the measurements from the first fit, for a second one; None leaves it at one.
         tracks_only: Gives the measurements instead of dense flow, which then only guides it.
 
     Raises:
@@ -98,7 +102,8 @@ def fill_in(
     )
     times_s = np.array(frames.times_s)
     shots = [
-        _ShotInfill(one, frames.matcher, reprojector, times_s, placed, trajectory, batch, tracks_only) for one in maps
+        _ShotInfill(one, frames.matcher, reprojector, times_s, placed, trajectory, batch, aligner, tracks_only)
+        for one in maps
     ]
     waiting = [shot for shot in shots if shot.moves]
     if not waiting:
@@ -132,6 +137,7 @@ class _ShotInfill:
         placed: NDArray[np.bool_],
         into: Trajectory,
         batch: int,
+        aligner: Aligner | None,
         tracks_only: SparseTracker | None,
     ) -> None:
         self.start, self.stop = shot_map.shot.start, shot_map.shot.stop
@@ -144,6 +150,7 @@ class _ShotInfill:
         self._reprojector = reprojector
         self._into = into
         self._batch = batch
+        self._aligner = aligner
         self._tracks_only = tracks_only
         self._pending: list[_Pending] = []
         frames = slice(self.start, self.stop)
@@ -175,7 +182,15 @@ class _ShotInfill:
         pending, self._pending = self._pending, []
         if not pending:
             return
-        solved = self._adjusted(pending) if self._fitter is None else self._turned(pending, self._fitter)
+        if self._fitter is not None:
+            solved: NDArray[np.float64] | None = self._turned(pending, self._fitter)
+        else:
+            solved = self._adjusted(pending, _SCHEDULE)
+            if solved is not None and self._aligner is not None:
+                pending = [
+                    self._sharpened(frame, pose, self._aligner) for frame, pose in zip(pending, solved, strict=True)
+                ]
+                solved = self._adjusted(pending, SETTLE)
         if solved is None:
             return
         into = self._into
@@ -196,14 +211,28 @@ class _ShotInfill:
             nearest.add(max(0, after - 2))
         matches = []
         for k in sorted(nearest):
-            guess = self._reprojector.induced(
-                self._keyframes.intrinsics, relative_pose(start, self._keyframes.pose(k)), self._keyframes.depth(k)
-            )
-            match = self._matcher.match_fast(self._keyframes.features[k], features, guess.target_px)
+            guess_px = self._induced(k, start).target_px
+            match = self._matcher.match_fast(self._keyframes.features[k], features, guess_px)
             if self._tracks_only is not None:
                 match = self._tracks_only.match(self._keyframes.features[k], features, match)
             matches.append((k, match))
-        return _Pending(index, np.array(start), tuple(matches))
+        return _Pending(index, features, np.array(start), tuple(matches))
+
+    def _sharpened(self, frame: _Pending, cam_from_world: Array, aligner: Aligner) -> _Pending:
+        """The frame with measurements that start from its pose."""
+        matches = []
+        for k, match in frame.matches:
+            induced = self._induced(k, cam_from_world)
+            wanted = induced.visible & self._usable[k]
+            guess_px = np.where(wanted[:, None], induced.target_px, np.float32(np.nan))
+            aligned = aligner.align(self._keyframes.features[k], frame.features, guess_px)
+            matches.append((k, sharpen(match, aligned)))
+        return _Pending(frame.index, frame.features, cam_from_world, tuple(matches))
+
+    def _induced(self, k: int, cam_from_world: Array) -> Induced:
+        """Where a pose sees the cells of keyframe `k`."""
+        relative = relative_pose(cam_from_world, self._keyframes.pose(k))
+        return self._reprojector.induced(self._keyframes.intrinsics, relative, self._keyframes.depth(k))
 
     def _turned(self, pending: list[_Pending], fitter: RotationFitter) -> NDArray[np.float64]:
         """(B, 4, 4) rotation-only poses of a batch."""
@@ -221,7 +250,7 @@ class _ShotInfill:
         poses[:, :3, :3] = fit.rotations[first:]
         return poses
 
-    def _adjusted(self, pending: list[_Pending]) -> NDArray[np.float64] | None:
+    def _adjusted(self, pending: list[_Pending], schedule: Sequence[Step]) -> NDArray[np.float64] | None:
         """(B, 4, 4) by a motion-only adjustment: keyframes are fixed sources, frames are free targets."""
         device = self._adjuster.device
         sources = sorted({k for frame in pending for k, _ in frame.matches})
@@ -253,7 +282,7 @@ class _ShotInfill:
             inverse_depth=torch.from_numpy(depths).to(device),
             intrinsics=torch.from_numpy(self._keyframes.intrinsics.copy()).to(device),
         )
-        result = self._adjuster.anneal(problem, state, _SCHEDULE)
+        result = self._adjuster.anneal(problem, state, schedule)
         return None if result is None else result.state.cam_from_world[first:].cpu().numpy()
 
     def _judged(self, frame: _Pending, cam_from_world: Array) -> _Fit:
@@ -261,11 +290,7 @@ class _ShotInfill:
         inside = total = coverage = 0.0
         errors = []
         for k, match in frame.matches:
-            induced = self._reprojector.induced(
-                self._keyframes.intrinsics,
-                relative_pose(cam_from_world, self._keyframes.pose(k)),
-                self._keyframes.depth(k),
-            )
+            induced = self._induced(k, cam_from_world)
             weight = match.weight.mean(axis=1) * self._usable[k]
             weight = np.where(weight > _MIN_WEIGHT, weight, 0)
             error = np.linalg.norm(induced.target_px - match.target_px, axis=1)

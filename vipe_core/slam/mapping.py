@@ -113,6 +113,7 @@ class ShotMapper:
             self._priors.points,
             reprojector,
             dense_flow=settings.terms.dense_flow,
+            aligner=self._priors.aligner,
         )
         masks = MotionMasks(
             reprojector, keyframes, graph, adjuster.robust_scale_px, enabled=settings.terms.motion_masks
@@ -136,7 +137,8 @@ class ShotMapper:
         with self._clock("backend"):
             adjusting()
             backend.run()
-        loops = examine_loops(reprojector, keyframes, graph, before, settings.neighbours)
+            loops = examine_loops(reprojector, keyframes, graph, before, settings.neighbours)
+            backend.sharpen()
         found = examine(reprojector, keyframes, graph, adjuster.robust_scale_px)
         motion: Motion = "static" if static else "general"
         focal, fitter = backend.focal, None

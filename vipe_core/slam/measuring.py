@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vipe_core.priors.protocols import Correspondences, DenseMatcher, Match, PointMatcher, SparseTracker
-from vipe_core.slam.graph import Graph, fuse
+from vipe_core.priors.protocols import Aligner, Correspondences, DenseMatcher, Match, PointMatcher, SparseTracker
+from vipe_core.slam.graph import Graph, fuse, sharpen
 from vipe_core.slam.guessing import displacement_guess
 from vipe_core.slam.keyframes import KeyframeMap
 from vipe_core.slam.reprojection import Reprojector
@@ -24,6 +24,7 @@ class MeasuredGraph:
     Args:
         sparse: Gives the sparse term; None leaves it out.
         dense_flow: Whether the dense term is filed, or only guides the sparse one.
+        aligner: Sharpens the dense term once the geometry is known; None leaves it as it is.
     """
 
     def __init__(
@@ -36,6 +37,7 @@ class MeasuredGraph:
         reprojector: Reprojector,
         *,
         dense_flow: bool = True,
+        aligner: Aligner | None = None,
     ) -> None:
         self.keyframes = keyframes
         self.graph = graph
@@ -44,6 +46,7 @@ class MeasuredGraph:
         self._points = points
         self._reprojector = reprojector
         self._dense_flow = dense_flow
+        self._aligner = aligner if dense_flow else None
 
     def overview(self, k: int) -> NDArray[np.float32]:
         """(n, D) descriptors by which the place of a keyframe is recognised; none without a matcher of points."""
@@ -100,6 +103,26 @@ class MeasuredGraph:
         self.graph.add(i, j, self._with_tracks(source, target, there))
         self.graph.add(j, i, self._with_tracks(target, source, back))
         return consistent
+
+    @property
+    def can_sharpen(self) -> bool:
+        return self._aligner is not None
+
+    def sharpen(self, i: int, j: int, min_aligned: float) -> None:
+        """Measure the static cells of i -> j once more, from where the poses and depths of the map put them.
+
+        Args:
+            min_aligned: A new edge is filed only if at least this share of its cells is aligned.
+        """
+        assert self._aligner is not None
+        induced = self._reprojector.edge(self.keyframes, i, j)
+        wanted = induced.visible & self.keyframes.static(i)
+        guess_px = np.where(wanted[:, None], induced.target_px, np.float32(np.nan))
+        aligned = self._aligner.align(self.keyframes.features[i], self.keyframes.features[j], guess_px)
+        if (i, j) in self.graph:
+            self.graph.add(i, j, sharpen(self.graph[i, j], aligned))
+        elif aligned.consistent >= min_aligned:
+            self.graph.add(i, j, aligned)
 
     def _with_tracks(self, source: Any, target: Any, dense: Match) -> Match:
         if self._sparse is None:

@@ -53,7 +53,9 @@ class SlamSettings:
         loop_edges_per_keyframe: Bound on proximity edges of the global graph.
         proximity_px: Largest mean induced displacement of a proximity edge.
         proximity_overlap: Least share of cells seen by both ends of a proximity edge.
-        min_consistent: Least forward-backward consistency of a proximity edge.
+        min_consistent: Least forward-backward consistency of a proximity edge, least aligned share of a wide one.
+        wide_steps: Keyframes apart of the edges that are added when the geometry is known.
+        wide_overlap: Least share of cells seen by both ends of such an edge.
         focal_sigma_inflation: Factor on the solver's formal 1-sigma of log focal that makes it match real errors.
         focal_doubt_sigma: An inflated sigma above this makes the result doubtful.
         infill_batch: Frames posed in one motion-only adjustment.
@@ -75,6 +77,8 @@ class SlamSettings:
     proximity_px: float = 80.0
     proximity_overlap: float = 0.6
     min_consistent: float = 0.4
+    wide_steps: tuple[int, ...] = (3, 4)
+    wide_overlap: float = 0.4
     focal_sigma_inflation: float = 6.0
     focal_doubt_sigma: float = 0.05
     infill_batch: int = 16

@@ -110,8 +110,9 @@ class Slam:
         maps = self._map(mapper, selection, main, estimate, report)
         with clock("infill"):
             tracks_only = None if settings.terms.dense_flow else self._priors.tracker
+            aligner = self._priors.aligner if settings.terms.dense_flow else None
             trajectory = fill_in(
-                maps, frames, selection.placed, mapper.reprojector, settings.infill_batch, report, tracks_only
+                maps, frames, selection.placed, mapper.reprojector, settings.infill_batch, report, aligner, tracks_only
             )
             frames.release()
         return SlamResult(

@@ -5,6 +5,7 @@ from __future__ import annotations
 from vipe_core.priors.classical.features import FlowFeatures
 from vipe_core.priors.classical.flow import DisFlowMatcher
 from vipe_core.priors.classical.focal import FocalVote, TwoViewFocalInit
+from vipe_core.priors.classical.patches import PatchAligner
 from vipe_core.priors.classical.sift import SiftMatcher
 from vipe_core.priors.classical.tracks import LkTracker
 from vipe_core.priors.protocols import PriorFamily
@@ -14,6 +15,7 @@ __all__ = [
     "FlowFeatures",
     "FocalVote",
     "LkTracker",
+    "PatchAligner",
     "SiftMatcher",
     "TwoViewFocalInit",
     "classical_priors",
@@ -21,9 +23,15 @@ __all__ = [
 
 
 def classical_priors() -> PriorFamily:
-    """DIS flow, Lucas-Kanade tracks, SIFT correspondences and the two-view focal vote.
+    """DIS flow, Lucas-Kanade tracks and patches, SIFT correspondences and the two-view focal vote.
 
     Make one per thread. The number of OpenCV threads is the caller's choice.
     """
     matcher = DisFlowMatcher()
-    return PriorFamily(matcher=matcher, tracker=LkTracker(), points=SiftMatcher(), intrinsics=TwoViewFocalInit(matcher))
+    return PriorFamily(
+        matcher=matcher,
+        tracker=LkTracker(),
+        points=SiftMatcher(),
+        intrinsics=TwoViewFocalInit(matcher),
+        aligner=PatchAligner(),
+    )
