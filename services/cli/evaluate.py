@@ -114,7 +114,7 @@ def _plan_videos(videos: Path, measure: Measure, max_frames: int | None) -> tupl
         text.append(f"Sampson errors are of {point_matcher(measure.matcher, measure.device).name} matches.")
     tasks = video_tasks(videos, measure, max_frames)
     first = "" if max_frames is None else f", the first {max_frames} frames of each"
-    text.insert(0, f"{len(tasks)} videos without ground truth{first}.")
+    text.insert(0, f"Videos without ground truth: {len(tasks)}{first}.")
     return tasks, _heading(f"Consistency on {videos.resolve().name}", text, measure)
 
 
