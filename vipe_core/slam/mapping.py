@@ -130,7 +130,7 @@ class ShotMapper:
             for done in range(first, len(chosen) + 1):
                 if done > first:
                     tracker.add(chosen[done - 1], times_s[done - 1])
-                if done in settings.backend_at and done < len(chosen):
+                if settings.backend_due(done) and done < len(chosen):
                     backend.run()
                 tracked(chosen[done - 1].index + 1)
         before = keyframes.snapshot()

@@ -12,6 +12,11 @@ from vipe_core.slam.keyframes import KeyframeMap
 from vipe_core.slam.reprojection import Reprojector
 
 _SUBSAMPLE = 4
+# With more candidates than this, the nearest so many by a coarse look are examined: at about three rows and columns,
+# in one direction, within so much of the limits.
+_EXAMINED = 64
+_COARSE_LINES = 3
+_COARSE_SLACK = 2.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,6 +52,10 @@ def close_pairs(
         older = [target for target in candidates if target < source]
         if not older:
             continue
+        if len(older) > _EXAMINED:
+            older = _screened(reprojector, keyframes, source, older, max_motion_px, min_overlap)
+            if not older:
+                continue
         there = reprojector.fan(keyframes, [source] * len(older), older, _SUBSAMPLE)
         back = reprojector.fan(keyframes, older, [source] * len(older), _SUBSAMPLE)
         overlap = np.minimum(there.overlap, back.overlap)
@@ -57,6 +66,23 @@ def close_pairs(
             if overlap[row] >= min_overlap and motion[row] <= max_motion_px
         ]
     return sorted(pairs, key=lambda pair: (pair.motion_px, pair.source, pair.target))
+
+
+def _screened(
+    reprojector: Reprojector,
+    keyframes: KeyframeMap,
+    source: int,
+    targets: Sequence[int],
+    max_motion_px: float,
+    min_overlap: float,
+) -> list[int]:
+    """The `_EXAMINED` targets that look nearest from `source`, in their order: the work per keyframe stays bounded."""
+    subsample = max(1, min(reprojector.grid.height, reprojector.grid.width) // _COARSE_LINES)
+    fan = reprojector.fan(keyframes, [source] * len(targets), targets, subsample)
+    possible = (fan.motion_px <= _COARSE_SLACK * max_motion_px) & (fan.overlap >= min_overlap / _COARSE_SLACK)
+    rows = np.flatnonzero(possible)
+    nearest = rows[np.argsort(fan.motion_px[rows], kind="stable")[:_EXAMINED]]
+    return [targets[row] for row in np.sort(nearest)]
 
 
 def loop_edges(pairs: Sequence[Pair], graph: Graph, limit: int, radius: int = 2) -> list[Pair]:

@@ -117,8 +117,8 @@ class Reprojector:
         rows = np.arange(subsample // 2, self.grid.height, subsample)
         columns = np.arange(subsample // 2, self.grid.width, subsample)
         cells = (rows[:, None] * self.grid.width + columns).reshape(-1)
-        relative = np.stack(
-            [relative_pose(keyframes.pose(j), keyframes.pose(i)) for i, j in zip(sources, targets, strict=True)]
+        relative = relative_pose(
+            np.stack([keyframes.pose(j) for j in targets]), np.stack([keyframes.pose(i) for i in sources])
         )
         depth = np.stack([keyframes.depth(i)[cells] for i in sources])
         induced = self.induced(keyframes.intrinsics, relative, depth, cells)
@@ -129,7 +129,7 @@ class Reprojector:
 
 
 def relative_pose(target_from_world: Array, source_from_world: Array) -> NDArray[np.float64]:
-    """(4, 4) target_from_source."""
+    """(..., 4, 4) target_from_source."""
     return np.asarray(
         se3.relative(torch.from_numpy(np.asarray(target_from_world)), torch.from_numpy(np.asarray(source_from_world)))
     )

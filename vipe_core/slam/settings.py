@@ -47,7 +47,8 @@ class SlamSettings:
         sample_frames: Bound on the frames held for the intrinsics initialisation.
         neighbours: Previous keyframes that a new one is matched with.
         window: Keyframes that the sliding window optimises.
-        backend_at: Keyframe counts at which a global adjustment runs in between.
+        backend_at: Increasing keyframe counts at which a global adjustment runs in between; after the last of them at
+            every doubling.
         depth_prior_weight: Information of the smoothness prior, px^2 per (inverse depth / its median)^2.
         robust_scale_px: Scale of the Geman-McClure kernel after annealing.
         loop_edges_per_keyframe: Bound on proximity edges of the global graph.
@@ -83,6 +84,13 @@ class SlamSettings:
     focal_doubt_sigma: float = 0.05
     infill_batch: int = 16
     terms: EnergyTerms = field(default_factory=EnergyTerms)
+
+    def backend_due(self, num_keyframes: int) -> bool:
+        """Whether a global adjustment runs at this many keyframes; their sizes sum to less than twice the last one."""
+        if not self.backend_at or num_keyframes <= self.backend_at[-1]:
+            return num_keyframes in self.backend_at
+        doublings, rest = divmod(num_keyframes, self.backend_at[-1])
+        return rest == 0 and doublings.bit_count() == 1
 
     def scaled_px(self, length_px: float, working_width: int) -> float:
         """A length stated for a 640 px wide image, in pixels of the actual working image."""
