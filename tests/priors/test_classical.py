@@ -317,3 +317,17 @@ def test_a_frame_that_is_masked_all_over_is_blank(room: BoxRoom) -> None:
     rgb = room.render(look((0, 0, -3)))[0]
     assert not matcher.is_blank(matcher.encode(frame(rgb)))
     assert matcher.is_blank(matcher.encode(frame(rgb, valid=np.zeros(rgb.shape[:2], bool))))
+
+
+def test_what_turns_black_is_not_measured_there() -> None:
+    room = BoxRoom(192, 144)
+    picture, _ = room.render(look((0.0, 0.0, -3.0)))
+    patched = picture.copy()
+    patched[40:104, 48:144] = 0
+    matcher = DisFlowMatcher()
+    frames = [WorkingFrame(k, rgb[..., 0], rgb) for k, rgb in enumerate((picture, patched))]
+    source, target = (matcher.encode(frame) for frame in frames)
+    there, _ = matcher.match(source, target)
+    weight = there.weight.max(axis=1).reshape(18, 24)
+    assert weight[7:11, 8:16].max() == 0
+    assert np.median(weight[:3]) > 0.3

@@ -29,9 +29,11 @@ _MIN_KEYFRAMES = 5
 _LOW_PARALLAX_DEG = 1.0
 _LOW_COVERAGE = 0.35
 _HIGH_RESIDUAL_RATIO = 0.8 / 640
+# A residual of so many times that is no fit at all.
+_VERY_HIGH = 2.0
 _MATCHING_NOISE_PX = 0.3
 _LOW_INLIERS = 0.9
-_VERY_LOW_INLIERS = 0.6
+_VERY_LOW_INLIERS = 0.4
 _WEAK_LINK = 0.08
 _MAX_INTERPOLATED = 0.02
 _MOSTLY_INTERPOLATED = 0.5
@@ -60,12 +62,15 @@ def assess(result: SlamResult, settings: SlamSettings, source_width: int) -> Qua
         if found.coverage < _LOW_COVERAGE:
             reasons.append("low_texture")
         # Written so that a NaN residual, of a map without a single measurement, counts as high.
-        if not found.residual_px <= max(_MATCHING_NOISE_PX, _HIGH_RESIDUAL_RATIO * result.working.width):
+        high_px = max(_MATCHING_NOISE_PX, _HIGH_RESIDUAL_RATIO * result.working.width)
+        if not found.residual_px <= high_px:
             reasons.append("high_residual")
-            fatal = True
+            fatal = not found.residual_px <= _VERY_HIGH * high_px
         if found.inlier_ratio < _LOW_INLIERS:
             reasons.append("low_inliers")
             fatal = fatal or found.inlier_ratio < _VERY_LOW_INLIERS
+        # Each of them can have an honest cause (walls, moving things, a bad lens); together they say that nothing fits.
+        fatal = fatal or len({"low_texture", "high_residual", "low_inliers"} & set(reasons)) > 1
         if found.weakest_link < _WEAK_LINK:
             reasons.append("weak_link")
             fatal = True

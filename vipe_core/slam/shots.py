@@ -4,8 +4,8 @@ A picture continues another when their thumbnails are about as alike as those of
 something of the one can be found in the other: cells whose flow agrees with the reverse flow, or corners under one
 two-view geometry. Appearance alone would call a wide step a cut, and flow alone a blurred one.
 
-A cut is believed when the pictures behind it continue each other; a picture that neither continues the last one nor is
-continued is passed over, so a flash leaves the shot in one piece.
+A cut is believed when the pictures behind it continue each other and show no place that the shot before it has shown; a
+picture that neither continues the last one nor is continued is passed over, so a flash leaves the shot in one piece.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ from __future__ import annotations
 import statistics
 from collections import deque
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import cv2
@@ -46,11 +47,13 @@ _MIN_SHARE = 0.65
 _MAX_CORNERS = 1000
 _RATIO = 0.8
 _EPIPOLAR_PX = 1.5
+# Pictures of a shot that are kept to recognise its places.
+_REMEMBERED = 24
 # A flash or a torn picture lasts at most this many frames; what lasts longer is a shot.
 _LONGEST_FLASH = 4
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Picture:
     """A frame with what continuity is judged by.
 
@@ -73,6 +76,14 @@ class Picture:
         small -= small.mean()
         return cls(frame.index, features, frame.gray, small / max(float(small.std()), _LEAST_CONTRAST))
 
+    @cached_property
+    def corners(self) -> tuple[Array, Array]:
+        """(n, 2) distinctive points, pixels, and (n, 128) their descriptors."""
+        points, descriptors = cv2.SIFT.create(_MAX_CORNERS).detectAndCompute(self.gray, None)
+        if not len(points):
+            return np.zeros((0, 2)), np.zeros((0, 128), np.float32)
+        return np.array([point.pt for point in points]), np.asarray(descriptors)
+
 
 @dataclass(frozen=True, slots=True)
 class Placed:
@@ -92,17 +103,20 @@ class ShotSplitter:
     def __init__(self, matcher: DenseMatcher) -> None:
         self._matcher = matcher
         self._last: Picture | None = None
+        self._shown: list[Picture] = []
+        self._spacing = 1
         self._waiting: list[Picture] = []
         self._steps: deque[float] = deque(maxlen=_HISTORY)
 
     def add(self, picture: Picture) -> list[Placed]:
         """The pictures whose place is known now, in order."""
         if self._last is None:
-            self._last = picture
+            self._remember(picture)
             return [Placed(picture, cut=False)]
         if self._continues(self._last, picture):
             # What waited was a flash: it belongs to nothing.
-            self._waiting, self._last = [], picture
+            self._waiting = []
+            self._remember(picture)
             return [Placed(picture, cut=False)]
         if self._waiting and not self._continues(self._waiting[-1], picture):
             self._waiting = []
@@ -114,9 +128,23 @@ class ShotSplitter:
         return self._new_shot() if len(self._waiting) > 1 else []
 
     def _new_shot(self) -> list[Placed]:
-        placed = [Placed(picture, cut=number == 0) for number, picture in enumerate(self._waiting)]
-        self._last, self._waiting = self._waiting[-1], []
-        return placed
+        waiting, self._waiting = self._waiting, []
+        ends = (waiting[0], waiting[-1])
+        cut = not any(_share_corners(shown, picture) for shown in reversed(self._shown) for picture in ends)
+        if cut:
+            self._shown, self._spacing = [], 1
+        for picture in waiting:
+            self._remember(picture)
+        return [Placed(picture, cut=cut and number == 0) for number, picture in enumerate(waiting)]
+
+    def _remember(self, picture: Picture) -> None:
+        """The last picture, and every so many-th one of the shot so that there are never too many."""
+        self._last = picture
+        if picture.index % self._spacing == 0:
+            self._shown.append(picture)
+        if len(self._shown) > _REMEMBERED:
+            self._spacing *= 2
+            self._shown = [shown for shown in self._shown if shown.index % self._spacing == 0]
 
     def _continues(self, before: Picture, after: Picture) -> bool:
         difference = 0.5 * float(np.square(before.thumbnail - after.thumbnail).mean())
@@ -127,22 +155,20 @@ class ShotSplitter:
     def _share_a_place(self, before: Picture, after: Picture) -> bool:
         there, back = self._matcher.match(before.features, after.features)
         measured = min(float((match.weight.max(axis=1) > _MIN_WEIGHT).mean()) for match in (there, back))
-        return measured >= _MEASURED or _share_corners(before.gray, after.gray)
+        return measured >= _MEASURED or _share_corners(before, after)
 
 
-def _share_corners(before: Array, after: Array) -> bool:
+def _share_corners(before: Picture, after: Picture) -> bool:
     """Whether most of the distinctive corners that look alike fit one two-view geometry."""
-    sift = cv2.SIFT.create(_MAX_CORNERS)
-    points_before, descriptors_before = sift.detectAndCompute(before, None)
-    points_after, descriptors_after = sift.detectAndCompute(after, None)
+    (points_before, descriptors_before), (points_after, descriptors_after) = before.corners, after.corners
     if min(len(points_before), len(points_after)) < _MIN_CORNERS:
         return False
     pairs = cv2.BFMatcher().knnMatch(descriptors_before, descriptors_after, k=2)
     kept = [best for best, second in pairs if best.distance < _RATIO * second.distance]
     if len(kept) < _MIN_CORNERS:
         return False
-    source = np.array([points_before[match.queryIdx].pt for match in kept])
-    target = np.array([points_after[match.trainIdx].pt for match in kept])
+    source = points_before[[match.queryIdx for match in kept]]
+    target = points_after[[match.trainIdx for match in kept]]
     options = {"max_epipolar_error": _EPIPOLAR_PX, "max_iterations": 500, "seed": 0}
     _, report = poselib.estimate_fundamental(source, target, options, {})
     fitting = int(np.sum(report["inliers"]))

@@ -38,6 +38,8 @@ _WIDE_MOTION_RATIO = 0.1
 # noise of a camera or an encoder, a structure of about 0.2 for each grey level of its standard deviation squared.
 _BLANK_SHARE = 0.01
 _BLANK_STRUCTURE = 0.5
+# A cell of so many times the structure of where it is seen, which has no more than a blank one, is not seen there.
+_LOST_RATIO = 20.0
 
 
 class _Flow:
@@ -186,6 +188,10 @@ def _measure(source: FlowFeatures, target: FlowFeatures, forward: Array, backwar
     usable = inside & source.usable_cells
     if target.usable is not None:
         usable &= sample_px(target.usable.astype(np.float32), target_px) > 0.5
+    # Against black, or anything else without structure, every flow agrees with its reverse.
+    strength = target.structure.max(axis=1).reshape(target.grid.height, target.grid.width)
+    seen = sample_px(strength, (target_px - target.grid.offset) / target.grid.stride)
+    usable &= (seen >= _BLANK_STRUCTURE) | (source.structure.max(axis=1) < _LOST_RATIO * seen)
     structure = source.structure / (source.structure + source.structure_floor)
     weight = np.where(usable, agreement, 0)[:, None] * structure
     consistent = float((error[usable] < tolerance[usable]).mean()) if usable.any() else 0.0
