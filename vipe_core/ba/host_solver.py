@@ -60,7 +60,7 @@ class HostSystem:
 
 
 class HostSolver:
-    """Cost, linearisation and step of one problem on the CPU. Built once per solve; holds no state of the unknowns."""
+    """Cost, linearisation and step of one problem on the CPU. Built once per solve."""
 
     def __init__(self, problem: Problem, options: Options, state: State) -> None:
         self.problem, self.options = problem, options
@@ -102,6 +102,7 @@ class HostSolver:
         self._kernel = kernels.ROBUST_CODE[options.robust]
         self._sample_px = problem.grid.sample_px()
         self._rays: tuple[Tensor, Array, Array, Array] | None = None
+        self._seen: tuple[State, kernels.Pose, Tensor] | None = None
         median = state.inverse_depth.median()
         self._depth_range = (options.min_inverse_depth * median, options.max_inverse_depth * median)
         cells = len(self._source) * problem.grid.num_cells
@@ -135,7 +136,15 @@ class HostSolver:
     # -- state -----------------------------------------------------------------------------------------------------
 
     def _pose(self, state: State) -> tuple[kernels.Pose, Tensor]:
-        """What the kernels need of a state, and the transforms of the edges."""
+        """What the kernels need of a state, and the transforms of the edges. The last one is kept.
+
+        An accepted state is judged first and linearised next.
+        """
+        if self._seen is None or self._seen[0] is not state:
+            self._seen = (state, *self._see(state))
+        return self._seen[1:]
+
+    def _see(self, state: State) -> tuple[kernels.Pose, Tensor]:
         model, intrinsics = self.problem.camera_model, state.intrinsics
         transform = se3.relative(state.cam_from_world[self._target], state.cam_from_world[self._source])
         if self._rays is None or not torch.equal(self._rays[0], intrinsics):
