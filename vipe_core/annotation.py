@@ -28,6 +28,8 @@ class Quality:
         coverage: Share of keyframe cells that at least one edge measures, 0..1.
         parallax_deg: Median over keyframes of the angle under which their points are seen.
         focal_sigma_ratio: 1-sigma of the focal length divided by the focal length (inflated to be honest).
+        fov_interval_deg: Horizontal field of view, lower and upper end of what `focal_sigma_ratio` makes 95 % likely;
+            NaN where nothing is known.
         frame_inlier_ratio: (N,) float32 per-frame inlier ratio of the pose fit.
         frame_residual_px: (N,) float32 per-frame `residual_px`; NaN where nothing was measured.
         frame_coverage: (N,) float32 share of the cells of each frame that its pose explains.
@@ -48,6 +50,7 @@ class Quality:
     parallax_deg: float
     focal_sigma_ratio: float
     frame_inlier_ratio: NDArray[np.float32]
+    fov_interval_deg: tuple[float, float] = (float("nan"), float("nan"))
     frame_residual_px: NDArray[np.float32] = field(default_factory=lambda: np.zeros(0, np.float32))
     frame_coverage: NDArray[np.float32] = field(default_factory=lambda: np.zeros(0, np.float32))
     frame_interpolated: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, np.bool_))
@@ -71,6 +74,7 @@ class Quality:
             "coverage": number(self.coverage),
             "parallax_deg": number(self.parallax_deg),
             "focal_sigma_ratio": number(self.focal_sigma_ratio),
+            "fov_interval_deg": [number(end) for end in self.fov_interval_deg],
             "num_interpolated": int(self.frame_interpolated.sum()),
             "cuts": list(self.cuts),
             "loop_edges": self.loop_edges,

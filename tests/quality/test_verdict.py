@@ -104,6 +104,14 @@ def test_each_defect_is_named(result: SlamResult, reason: str, reliable: str) ->
     assert quality.reliable == reliable
 
 
+def test_the_field_of_view_comes_with_an_interval_as_wide_as_the_focal_length_is_unsure() -> None:
+    low, high = verdict(good()).fov_interval_deg
+    # log(f) +- 0.0196 about 60 degrees: d fov = sin(fov) d log(f)
+    assert (low, high) == pytest.approx((60 - 0.9726, 60 + 0.9726), abs=0.02)
+    wider = verdict(good(focal=FocalReport(0.3, observed=False))).fov_interval_deg
+    assert wider[0] < 40 < 80 < wider[1] < 180
+
+
 def test_the_summary_is_json_ready() -> None:
     summary = verdict(good(map=good_map(residual_px=float("nan")))).summary()
     assert summary["residual_px"] is None

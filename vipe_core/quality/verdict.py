@@ -18,6 +18,8 @@ Reason codes are stable: they are stored with every video.
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from vipe_core.annotation import Quality, Reliability
@@ -37,6 +39,8 @@ _VERY_LOW_INLIERS = 0.4
 _WEAK_LINK = 0.08
 _MAX_INTERPOLATED = 0.02
 _MOSTLY_INTERPOLATED = 0.5
+# A sigma of log(f) beyond this says nothing more.
+_NO_IDEA = 1.0
 
 
 def assess(result: SlamResult, settings: SlamSettings, source_width: int) -> Quality:
@@ -92,6 +96,7 @@ def assess(result: SlamResult, settings: SlamSettings, source_width: int) -> Qua
         coverage=found.coverage,
         parallax_deg=found.parallax_deg,
         focal_sigma_ratio=result.focal.sigma_ratio,
+        fov_interval_deg=_fov_interval_deg(result),
         frame_inlier_ratio=result.trajectory.inlier_ratio,
         frame_residual_px=(result.trajectory.residual_px * to_source).astype(np.float32),
         frame_coverage=result.trajectory.coverage,
@@ -102,3 +107,11 @@ def assess(result: SlamResult, settings: SlamSettings, source_width: int) -> Qua
         loop_residual_after_px=result.loops.residual_after_px * to_source,
         loop_moved_ratio=result.loops.moved_ratio,
     )
+
+
+def _fov_interval_deg(result: SlamResult) -> tuple[float, float]:
+    """The field of view for the focal length's 95 % interval, in which log(f) is taken to be normal."""
+    camera = result.camera
+    half = math.exp(1.96 * min(result.focal.sigma_ratio, _NO_IDEA))
+    low, high = (2 * math.degrees(math.atan(camera.width / 2 / (camera.focal_px * f))) for f in (half, 1 / half))
+    return low, high

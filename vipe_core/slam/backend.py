@@ -136,7 +136,8 @@ class Backend:
         if result is None:
             return None
         prior_sigma = self._adjuster.focal_prior.sigma
-        sigma = self._settings.focal_sigma_inflation * result.log_focal_sigma
+        # A pinhole leaves out the distortion of a real lens, which more measurements do not average away.
+        sigma = math.hypot(self._settings.focal_sigma_inflation * result.log_focal_sigma, self._settings.lens_sigma)
         fov_deg = math.degrees(2 * math.atan(self._width / 2 / float(self._keyframes.intrinsics[0])))
         if math.isfinite(sigma) and _FOV_RANGE_DEG[0] < fov_deg < _FOV_RANGE_DEG[1]:
             self.focal = FocalReport(sigma, observed=sigma < _OBSERVED_RATIO * prior_sigma)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
@@ -175,5 +176,5 @@ class ShotMapper:
             keyframes.set_pose(k, pose)
             keyframes.set_depth(k, np.ones(keyframes.grid.num_cells))
             keyframes.set_static(k, np.ones(keyframes.grid.num_cells, dtype=np.bool_))
-        sigma = inflation * fit.log_focal_sigma
+        sigma = math.hypot(inflation * fit.log_focal_sigma, self._settings.lens_sigma)
         return FocalReport(sigma, observed=sigma < prior.sigma)

@@ -58,6 +58,7 @@ class SlamSettings:
         wide_steps: Keyframes apart of the edges that are added when the geometry is known.
         wide_overlap: Least share of cells seen by both ends of such an edge.
         focal_sigma_inflation: Factor on the solver's formal 1-sigma of log focal that makes it match real errors.
+        lens_sigma: 1-sigma of log focal from what a pinhole leaves out of a real lens: about one per cent.
         focal_doubt_sigma: An inflated sigma above this makes the result doubtful.
         infill_batch: Frames posed in one motion-only adjustment.
         terms: Which terms of the energy are there.
@@ -81,6 +82,7 @@ class SlamSettings:
     wide_steps: tuple[int, ...] = (3, 4)
     wide_overlap: float = 0.4
     focal_sigma_inflation: float = 6.0
+    lens_sigma: float = 0.01
     focal_doubt_sigma: float = 0.05
     infill_batch: int = 16
     terms: EnergyTerms = field(default_factory=EnergyTerms)
