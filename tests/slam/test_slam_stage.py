@@ -103,3 +103,18 @@ def test_what_the_report_raises_ends_the_run() -> None:
     scene = ExactScene(trajectory(12, ARC))
     with pytest.raises(Cancelled):
         Slam(scene.priors(), SlamSettings(), torch.device("cpu")).run(scene, report)
+
+
+def test_the_global_adjustment_shows_signs_of_life_and_can_be_cancelled_in_between() -> None:
+    scene = ExactScene(trajectory(12, ARC))
+    signs = 0
+
+    def report(stage: str, done: int, total: int | None) -> None:
+        nonlocal signs
+        signs += stage == "backend"
+        if signs == 3:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        Slam(scene.priors(), SlamSettings(), torch.device("cpu")).run(scene, report)
+    assert signs == 3

@@ -7,7 +7,7 @@ from wide to narrow.
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -71,12 +71,16 @@ class Adjuster:
 
     Args:
         focal_prior: Holds log(fx) softly whenever the focal length is free.
+
+    Attributes:
+        alive: Called before every solve: a sign of life for a supervisor. What it raises ends the adjustment.
     """
 
     def __init__(self, settings: SlamSettings, device: torch.device, focal_prior: FocalPrior, scale_px: float) -> None:
         self.settings = settings
         self.device = device
         self.focal_prior = focal_prior
+        self.alive: Callable[[], None] = _nothing
         # Geometry shrinks with the image, the noise of matching does not.
         self.robust_scale_px = max(_MIN_ROBUST_SCALE_PX, settings.robust_scale_px * scale_px)
         # The cost is in px^2 of the working image: a smaller image has smaller residuals for the same geometry.
@@ -148,6 +152,7 @@ class Adjuster:
         """Solve with each kernel of the schedule in turn; None when the very first solve fails."""
         result: Result | None = None
         for step in schedule:
+            self.alive()
             options = Options(
                 max_iterations=step.iterations,
                 robust=step.robust,
@@ -188,3 +193,7 @@ class Adjuster:
         median = max(float(np.median(depths)), 1e-6)
         information = np.full(depths.shape, self._depth_prior_weight / median**2, dtype=np.float32)
         return torch.from_numpy(prior).to(self.device), torch.from_numpy(information).to(self.device)
+
+
+def _nothing() -> None:
+    pass

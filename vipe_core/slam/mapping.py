@@ -100,7 +100,7 @@ class ShotMapper:
         Args:
             intrinsics: (K,) index parameters to start from.
             tracked: Told the frame up to which the shot is tracked.
-            adjusting: Called before the final global adjustment.
+            adjusting: Called before the final global adjustment and before each of its solves.
         """
         settings, size, reprojector = self._settings, self._size, self.reprojector
         scale_px = settings.scaled_px(1.0, size.width)
@@ -136,8 +136,10 @@ class ShotMapper:
                 tracked(chosen[done - 1].index + 1)
         before = keyframes.snapshot()
         with self._clock("backend"):
+            adjuster.alive = adjusting
             adjusting()
             backend.run()
+            adjuster.alive = lambda: None
             loops = examine_loops(reprojector, keyframes, graph, before, settings.neighbours)
             backend.sharpen()
         found = examine(reprojector, keyframes, graph, adjuster.robust_scale_px)

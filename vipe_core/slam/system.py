@@ -146,7 +146,14 @@ class Slam:
             def tracked(index: int, shot: Shot = shot, before: int = before) -> None:
                 report("track", before + index - shot.start, selection.num_frames)
 
-            maps[number] = mapper.run(shot, intrinsics, prior, tracked, lambda: None)
+            def adjusting(last: bool = len(maps) == len(selection.shots) - 1, before: int = before) -> None:
+                # The stages come one after the other, though every shot has both.
+                if last:
+                    report("backend", 0, 1)
+                else:
+                    report("track", before, selection.num_frames)
+
+            maps[number] = mapper.run(shot, intrinsics, prior, tracked, adjusting)
             done += shot.stop - shot.start
             if number == main:
                 intrinsics = maps[main].keyframes.intrinsics
