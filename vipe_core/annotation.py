@@ -130,6 +130,10 @@ ProgressCallback = Callable[[Progress], None]
 """Called often, from the thread that annotates. What it raises ends the annotation: the way to cancel."""
 
 
+MASK_PHRASES = {0: "background", 1: "moving"}
+"""What the ids of a mask stand for."""
+
+
 @dataclass(frozen=True, slots=True)
 class DenseFrame:
     """One frame of the dense stream.
@@ -139,12 +143,14 @@ class DenseFrame:
         rgb: (H, W, 3) uint8, upright, at source resolution.
         depth: (H, W) float32 in units of the trajectory; 0 where there is no value.
         confidence: (H, W) float32 in 0..1: 0 is a value that was filled in, not measured.
+        mask: (H, W) uint8 instance ids, `MASK_PHRASES` says of what; 0 is the static background.
     """
 
     index: int
     rgb: NDArray[np.uint8]
     depth: NDArray[np.float32]
     confidence: NDArray[np.float32]
+    mask: NDArray[np.uint8]
 
 
 @dataclass(frozen=True, slots=True)

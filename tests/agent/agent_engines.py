@@ -104,9 +104,8 @@ def fake_annotation(name: str, frames: int) -> Annotation:
     def dense() -> Iterator[DenseFrame]:
         for index in range(frames):
             shape = (HEIGHT, WIDTH)
-            yield DenseFrame(
-                index, np.zeros((*shape, 3), np.uint8), np.full(shape, 2.0, np.float32), np.ones(shape, np.float32)
-            )
+            rgb, depth = np.zeros((*shape, 3), np.uint8), np.full(shape, 2.0, np.float32)
+            yield DenseFrame(index, rgb, depth, np.ones(shape, np.float32), np.zeros(shape, np.uint8))
 
     return Annotation(
         name=name,

@@ -34,7 +34,13 @@ def annotation_of(clip: SyntheticClip, name: str, camera: Camera) -> Annotation:
 
     def dense() -> Iterator[DenseFrame]:
         for k, rgb in enumerate(clip.rgb):
-            yield DenseFrame(k, rgb, depth[k].astype(np.float32), np.ones(depth[k].shape, np.float32))
+            yield DenseFrame(
+                k,
+                rgb,
+                depth[k].astype(np.float32),
+                np.ones(depth[k].shape, np.float32),
+                np.zeros(depth[k].shape, np.uint8),
+            )
 
     count = len(clip.rgb)
     return Annotation(

@@ -30,7 +30,7 @@ def make_annotation(
         for index in range(num_frames if dense_frames is None else dense_frames):
             rgb = np.full((HEIGHT, WIDTH, 3), 20 + 10 * index, np.uint8)
             depth = depth_of(index)
-            yield DenseFrame(index, rgb, depth, (depth > 0).astype(np.float32))
+            yield DenseFrame(index, rgb, depth, (depth > 0).astype(np.float32), (depth > 1).astype(np.uint8))
 
     angles = np.linspace(0, 0.5, num_frames)
     poses = np.tile(np.eye(4), (num_frames, 1, 1))

@@ -42,7 +42,8 @@ def posed(interpolated: int = 0) -> Trajectory:
     """The first frames are interpolated."""
     ratio = np.ones(_FRAMES, dtype=np.float32)
     ratio[:interpolated] = 0
-    return Trajectory(np.tile(np.eye(4), (_FRAMES, 1, 1)), 0.1 * ratio, ratio, ratio, ratio == 0)
+    labels = np.zeros((_FRAMES, 1), dtype=np.int8)
+    return Trajectory(np.tile(np.eye(4), (_FRAMES, 1, 1)), 0.1 * ratio, ratio, ratio, ratio == 0, labels)
 
 
 def good(**changes: object) -> SlamResult:

@@ -1,4 +1,4 @@
-"""Writing an annotation as ViPE artifacts: `pose`, `intrinsics`, `depth`, `rgb`, and our own `vipe/NAME_info.json`.
+"""Writing an annotation as ViPE artifacts: `pose`, `intrinsics`, `depth`, `rgb`, `mask`, and `vipe/NAME_info.json`.
 
 Payload bytes depend on the annotation only (never on time, order of hashing or this machine's paths), and nothing
 appears under its final name before all of it is complete. Upstream keeps its description in a pickle; ours is JSON.
@@ -19,16 +19,17 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from vipe_core.annotation import Annotation, DenseFrame, DepthKind
+from vipe_core.annotation import MASK_PHRASES, Annotation, DenseFrame, DepthKind
 from vipe_core.cameras import Camera, CameraModel
 from vipe_core.errors import EngineError
 from vipe_core.formats.depth_zip import DepthZipWriter
 from vipe_core.formats.layout import artifact_files, artifact_path, info_path
+from vipe_core.formats.mask_zip import MaskZipWriter
 from vipe_core.video.encode import VideoWriter
 from vipe_core.video.naming import sanitise_name
 
-Attribute = Literal["pose", "intrinsics", "depth", "rgb"]
-ALL_ATTRIBUTES: tuple[Attribute, ...] = ("pose", "intrinsics", "depth", "rgb")
+Attribute = Literal["pose", "intrinsics", "depth", "rgb", "mask"]
+ALL_ATTRIBUTES: tuple[Attribute, ...] = ("pose", "intrinsics", "depth", "rgb", "mask")
 
 INFO_SCHEMA = 1
 # What a depth value means on disk is fixed by the camera: along the axis, except for panoramas.
@@ -48,10 +49,12 @@ class ArtifactPaths:
     camera_txt: Path | None
     depth: Path | None
     rgb: Path | None
+    mask: Path | None
+    mask_txt: Path | None
 
     @property
     def files(self) -> tuple[Path, ...]:
-        optional = (self.pose, self.intrinsics, self.camera_txt, self.depth, self.rgb)
+        optional = (self.pose, self.intrinsics, self.camera_txt, self.depth, self.rgb, self.mask, self.mask_txt)
         return (*(path for path in optional if path is not None), self.info)
 
 
@@ -62,7 +65,7 @@ def write_artifacts(
     attributes: Sequence[Attribute] = ALL_ATTRIBUTES,
     progress: Callable[[int, int], None] | None = None,
 ) -> ArtifactPaths:
-    """Write `annotation` below `root`, consuming its dense stream once (not at all without `depth` and `rgb`).
+    """Write `annotation` below `root`, consuming its dense stream once (not at all without `depth`, `rgb` and `mask`).
 
     An earlier result of the same name is replaced: first its `_info.json` goes, then its files, then the new
     `_info.json` appears, so that its presence always means a complete sequence with nothing of an earlier one. Depth is
@@ -110,6 +113,8 @@ def write_artifacts(
         camera_txt=moved.get("camera_txt"),
         depth=moved.get("depth"),
         rgb=moved.get("rgb"),
+        mask=moved.get("mask"),
+        mask_txt=moved.get("mask_txt"),
     )
 
 
@@ -157,16 +162,25 @@ def _write_all(
         kind = DISK_CAMERA_NAMES[annotation.camera.model]
         path = new("camera_txt", artifact_path(work, name, "intrinsics", "camera.txt"))
         path.write_text("".join(f"{index}: {kind}\n" for index in range(count)), encoding="ascii")
-    if "depth" in attributes or "rgb" in attributes:
+    mask: Path | None = None
+    if "mask" in attributes:
+        mask = new("mask", artifact_path(work, name, "mask", "zip"))
+        path = new("mask_txt", artifact_path(work, name, "mask", "txt"))
+        path.write_text("".join(f"{number}: {phrase}\n" for number, phrase in MASK_PHRASES.items()), encoding="ascii")
+    if {"depth", "rgb", "mask"} & set(attributes):
         depth = new("depth", artifact_path(work, name, "depth", "zip")) if "depth" in attributes else None
         rgb = new("rgb", artifact_path(work, name, "rgb", "mp4")) if "rgb" in attributes else None
-        _write_dense(annotation, depth, rgb, progress)
+        _write_dense(annotation, depth, rgb, mask, progress)
     new("info", info_path(work, name)).write_text(_info_json(annotation, attributes), encoding="utf-8")
     return written
 
 
 def _write_dense(
-    annotation: Annotation, depth_path: Path | None, rgb_path: Path | None, progress: Callable[[int, int], None] | None
+    annotation: Annotation,
+    depth_path: Path | None,
+    rgb_path: Path | None,
+    mask_path: Path | None,
+    progress: Callable[[int, int], None] | None,
 ) -> None:
     total = annotation.num_frames
     done = 0
@@ -174,6 +188,7 @@ def _write_dense(
     with ExitStack() as stack:
         depth = stack.enter_context(DepthZipWriter(depth_path)) if depth_path else None
         rgb = stack.enter_context(VideoWriter(rgb_path, annotation.fps)) if rgb_path else None
+        mask = stack.enter_context(MaskZipWriter(mask_path)) if mask_path else None
         # Closed here, not when an exception's traceback lets go of it: decoder processes are behind it.
         for frame in stack.enter_context(closing(annotation.dense())):
             _check_dense(annotation, frame, done)
@@ -181,6 +196,8 @@ def _write_dense(
                 depth.append(frame.depth if factor is None else frame.depth * factor)
             if rgb is not None:
                 rgb.write(frame.rgb)
+            if mask is not None:
+                mask.append(frame.mask)
             done += 1
             if progress is not None:
                 progress(done, total)
@@ -192,7 +209,8 @@ def _check_dense(annotation: Annotation, frame: DenseFrame, expected_index: int)
     camera = annotation.camera
     if frame.index != expected_index or frame.index >= annotation.num_frames:
         raise EngineError(f"{annotation.name}: the dense stream gave frame {frame.index} as number {expected_index}")
-    if frame.depth.shape != (camera.height, camera.width) or frame.rgb.shape != (camera.height, camera.width, 3):
+    size = (camera.height, camera.width)
+    if frame.depth.shape != size or frame.mask.shape != size or frame.rgb.shape != (*size, 3):
         raise EngineError(
             f"{annotation.name}: frame {frame.index} is not of the camera's size {camera.width}x{camera.height}"
         )

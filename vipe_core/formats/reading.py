@@ -18,6 +18,7 @@ from vipe_core.errors import ConfigError, FormatError, VipeError
 from vipe_core.formats.artifacts import DISK_DEPTH_KINDS
 from vipe_core.formats.depth_zip import DepthZipReader
 from vipe_core.formats.layout import artifact_path, info_path
+from vipe_core.formats.mask_zip import MaskZipReader
 from vipe_core.video.probe import probe
 
 _MODELS: dict[str, tuple[CameraModel, int]] = {
@@ -60,6 +61,10 @@ class Artifacts:
         return artifact_path(self.root, self.name, "depth", "zip").is_file()
 
     @property
+    def has_mask(self) -> bool:
+        return artifact_path(self.root, self.name, "mask", "zip").is_file()
+
+    @property
     def rgb_path(self) -> Path | None:
         path = artifact_path(self.root, self.name, "rgb", "mp4")
         return path if path.is_file() else None
@@ -74,6 +79,18 @@ class Artifacts:
         if len(reader) != self.num_frames:
             reader.close()
             raise FormatError(f"{self.name}: {len(reader)} depth maps for {self.num_frames} poses")
+        return reader
+
+    def open_mask(self) -> MaskZipReader:
+        """Masks of instance ids, one per pose; close it after use.
+
+        Raises:
+            FormatError: No masks, a damaged archive, or another number of masks than poses.
+        """
+        reader = MaskZipReader(artifact_path(self.root, self.name, "mask", "zip"))
+        if len(reader) != self.num_frames:
+            reader.close()
+            raise FormatError(f"{self.name}: {len(reader)} masks for {self.num_frames} poses")
         return reader
 
 

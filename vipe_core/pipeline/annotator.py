@@ -20,6 +20,7 @@ from vipe_core.pipeline.presets import Preset, resolve
 from vipe_core.pipeline.provenance import engine_version, library_versions
 from vipe_core.priors.classical import classical_priors
 from vipe_core.quality import assess
+from vipe_core.slam.segmentation import segment
 from vipe_core.slam.system import Slam, SlamResult
 from vipe_core.video import open_source
 from vipe_core.video.source import FrameSource
@@ -125,7 +126,7 @@ class Annotator:
     def _dense(
         self, source: FrameSource, result: SlamResult, timings: dict[str, float], report: _Reporter
     ) -> Generator[DenseFrame, None, None]:
-        """Dense depth of every frame in order; the time spent in it, not in its consumer, is added to `timings`."""
+        """Depth and mask of every frame in order; the time spent here, not in the consumer, is added to `timings`."""
         total = len(result.timestamps_s)
         spent_s = 0.0
         with _typed_errors(source, report):
@@ -135,11 +136,13 @@ class Annotator:
                 start_s = time.perf_counter()
                 with _typed_errors(source, report):
                     frame = next(frames, None)
+                    if frame is not None:
+                        mask = segment(frame.rgb, result.trajectory.labels[frame.index], result.grid)
                 spent_s += time.perf_counter() - start_s
                 timings["depth"] = spent_s
                 if frame is None:
                     return
-                yield DenseFrame(frame.index, frame.rgb, frame.depth, frame.confidence)
+                yield DenseFrame(frame.index, frame.rgb, frame.depth, frame.confidence, mask)
                 report("depth", frame.index + 1, total)
 
 

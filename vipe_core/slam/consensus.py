@@ -27,6 +27,9 @@ Array = NDArray[Any]
 MIN_WEIGHT = 0.02
 """Raw weight from which a cell counts as measured: its flow passed the check and it is not perfectly blank."""
 
+MAJORITY = 0.5
+"""Share of the cells that must agree on a pose for it to be believed."""
+
 _MIN_POINTS = 50
 _MAX_POINTS = 1500
 

@@ -16,11 +16,13 @@ from vipe_core.ba.problem import Edges, Free, Problem, State
 from vipe_core.geometry.arrays import interpolate_trajectory
 from vipe_core.priors.protocols import Aligner, DenseMatcher, Match, SparseTracker
 from vipe_core.slam.adjustment import SETTLE, Step
+from vipe_core.slam.consensus import MAJORITY, consensus_pose
 from vipe_core.slam.frames import EncodedFrames
 from vipe_core.slam.graph import sharpen
 from vipe_core.slam.mapping import ShotMap
 from vipe_core.slam.reprojection import Induced, Reprojector, relative_pose
 from vipe_core.slam.rotation import Link, RotationFitter
+from vipe_core.slam.segmentation import UNKNOWN, carried
 from vipe_core.slam.selection import Report
 
 Array = NDArray[Any]
@@ -42,6 +44,7 @@ class Trajectory:
         coverage: (N,) float32 share of the cells that fit: of a keyframe its own, of any other frame those of the
             keyframe that sees it best.
         interpolated: (N,) bool, True on frames whose pose is interpolated because nothing measures it.
+        labels: (N, P) int8, what each cell of a frame does; see `segmentation.py`.
     """
 
     cam_from_world: NDArray[np.float64]
@@ -49,16 +52,22 @@ class Trajectory:
     inlier_ratio: NDArray[np.float32]
     coverage: NDArray[np.float32]
     interpolated: NDArray[np.bool_]
+    labels: NDArray[np.int8]
 
 
 @dataclass(frozen=True, slots=True)
 class _Pending:
-    """A frame that waits for its batch: its number, its features, its start, and its measurements from keyframes."""
+    """A frame that waits for its batch: its number, its features, its start, and its measurements from keyframes.
+
+    Attributes:
+        agreed: (P,) bool for each match, cells that may take part in the fit.
+    """
 
     index: int
     features: Any
     start: NDArray[np.float64]
     matches: tuple[tuple[int, Match], ...]
+    agreed: tuple[NDArray[np.bool_], ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,6 +108,7 @@ def fill_in(
         np.zeros(count, dtype=np.float32),
         np.zeros(count, dtype=np.float32),
         np.ones(count, dtype=np.bool_),
+        np.full((count, reprojector.grid.num_cells), UNKNOWN, dtype=np.int8),
     )
     times_s = np.array(frames.times_s)
     shots = [
@@ -146,6 +156,7 @@ class _ShotInfill:
         self._adjuster = shot_map.adjuster
         self._fitter = shot_map.fitter
         self._usable = shot_map.usable
+        self._labels = shot_map.labels
         self._matcher = matcher
         self._reprojector = reprojector
         self._into = into
@@ -168,6 +179,7 @@ class _ShotInfill:
             into.inlier_ratio[index] = shot_map.found.keyframe_inlier_ratio[k]
             into.coverage[index] = shot_map.found.keyframe_coverage[k]
             into.interpolated[index] = False
+            into.labels[index] = shot_map.labels[k]
 
     def add(self, index: int, features: Any) -> None:
         """Measure a frame; every so many are posed together."""
@@ -210,13 +222,34 @@ class _ShotInfill:
         if len(nearest) == 1 and len(self._keyframes) > 1:
             nearest.add(max(0, after - 2))
         matches = []
+        said = np.zeros(self._keyframes.grid.num_cells, dtype=np.float32)
         for k in sorted(nearest):
             guess_px = self._induced(k, start).target_px
             match = self._matcher.match_fast(self._keyframes.features[k], features, guess_px)
             if self._tracks_only is not None:
                 match = self._tracks_only.match(self._keyframes.features[k], features, match)
             matches.append((k, match))
-        return _Pending(index, features, np.array(start), tuple(matches))
+            said += carried(self._labels[k], match, self._keyframes.grid)
+        self._into.labels[index] = np.sign(said)
+        return self._started(index, features, np.array(start), tuple(matches))
+
+    def _started(
+        self, index: int, features: Any, interpolated: NDArray[np.float64], matches: tuple[tuple[int, Match], ...]
+    ) -> _Pending:
+        """Start at the pose that most of the picture agrees on, with the cells that do; where no majority agrees on
+        one, at the interpolated pose with all cells."""
+        scale_px = self._adjuster.robust_scale_px
+        usable = tuple(self._usable[k] for k, _ in matches)
+        if self._fitter is not None:
+            return _Pending(index, features, interpolated, matches, usable)
+        found = consensus_pose(self._reprojector, self._keyframes, matches, usable, scale_px)
+        if found is None or found[1] < MAJORITY:
+            return _Pending(index, features, interpolated, matches, usable)
+        agreed = []
+        for (k, match), known in zip(matches, usable, strict=True):
+            error = np.linalg.norm(self._induced(k, found[0]).target_px - match.target_px, axis=1)
+            agreed.append(known & (error < scale_px))
+        return _Pending(index, features, found[0], matches, tuple(agreed))
 
     def _sharpened(self, frame: _Pending, cam_from_world: Array, aligner: Aligner) -> _Pending:
         """The frame with measurements that start from its pose."""
@@ -227,7 +260,7 @@ class _ShotInfill:
             guess_px = np.where(wanted[:, None], induced.target_px, np.float32(np.nan))
             aligned = aligner.align(self._keyframes.features[k], frame.features, guess_px)
             matches.append((k, sharpen(match, aligned)))
-        return _Pending(frame.index, frame.features, cam_from_world, tuple(matches))
+        return _Pending(frame.index, frame.features, cam_from_world, tuple(matches), frame.agreed)
 
     def _induced(self, k: int, cam_from_world: Array) -> Induced:
         """Where a pose sees the cells of keyframe `k`."""
@@ -258,7 +291,8 @@ class _ShotInfill:
         first = len(sources)
         total = first + len(pending)
         links = [(number[k], first + row, match) for row, frame in enumerate(pending) for k, match in frame.matches]
-        weight = np.stack([match.weight * self._usable[sources[i]][:, None] for i, _, match in links])
+        agreed = [cells for frame in pending for cells in frame.agreed]
+        weight = np.stack([match.weight * cells[:, None] for (_, _, match), cells in zip(links, agreed, strict=True)])
         edges = Edges(
             source=torch.tensor([i for i, _, _ in links], dtype=torch.int64, device=device),
             target=torch.tensor([j for _, j, _ in links], dtype=torch.int64, device=device),

@@ -23,6 +23,7 @@ from vipe_core.slam.masks import MotionMasks
 from vipe_core.slam.measuring import MeasuredGraph
 from vipe_core.slam.reprojection import Reprojector
 from vipe_core.slam.rotation import Link, RotationFitter
+from vipe_core.slam.segmentation import UNKNOWN
 from vipe_core.slam.selection import Shot
 from vipe_core.slam.settings import SlamSettings
 from vipe_core.slam.timing import StageClock
@@ -53,6 +54,7 @@ class ShotMap:
         adjuster: Ran its adjustments.
         fitter: Fits rotations, where there is nothing else to fit.
         usable: (K, P) bool, cells of each keyframe that are static and whose depth other views confirm.
+        labels: (K, P) int8, what each cell of a keyframe does; see `segmentation.py`.
     """
 
     shot: Shot
@@ -65,6 +67,7 @@ class ShotMap:
     adjuster: Adjuster
     fitter: RotationFitter | None
     usable: NDArray[np.bool_]
+    labels: NDArray[np.int8]
 
 
 class ShotMapper:
@@ -153,9 +156,11 @@ class ShotMapper:
                 motion, focal, fitter = "rotation", turned, candidate
                 found = examine(reprojector, keyframes, graph, adjuster.robust_scale_px)
         usable = keyframes.statics()
+        labels = np.full(usable.shape, UNKNOWN, dtype=np.int8)
         if motion == "general":
             usable = np.stack([masks.reliable(k) for k in range(len(keyframes))])
-        return ShotMap(shot, keyframes, graph, motion, focal, found, loops, adjuster, fitter, usable)
+            labels = np.stack([masks.labels(k) for k in range(len(keyframes))])
+        return ShotMap(shot, keyframes, graph, motion, focal, found, loops, adjuster, fitter, usable, labels)
 
     def _rotation_only(
         self, fitter: RotationFitter, keyframes: KeyframeMap, graph: Graph, prior: FocalPrior, found: MapReport

@@ -19,10 +19,12 @@ from vipe_core.slam.consensus import Agreement, agree
 from vipe_core.slam.graph import Graph
 from vipe_core.slam.keyframes import KeyframeMap
 from vipe_core.slam.reprojection import Reprojector, relative_pose
+from vipe_core.slam.segmentation import MOVING, STATIC, UNKNOWN
 
 Array = NDArray[Any]
 
 _MAX_MOVING = 0.6
+_SURE_VOTES = 2
 # What is further off than so many standard deviations of the measurements contradicts, but for a floor: a share of the
 # robust scale below which errors of matching are no longer independent of one another.
 _CONTRADICTION_SIGMA = 4.0
@@ -95,6 +97,24 @@ class MotionMasks:
         image = cv2.medianBlur(image, 3)
         image = cv2.dilate(image, np.ones((3, 3), np.uint8))
         return np.asarray(image, dtype=np.bool_).reshape(-1)
+
+    def labels(self, k: int) -> NDArray[np.int8]:
+        """(P,) what each cell of keyframe `k` does: `MOVING`, `STATIC`, or `UNKNOWN` with less than two views.
+
+        Surer than the masks of the adjustment, which rather leave out too much: only a contradiction by the whole
+        robust scale is motion.
+        """
+        grid = self._keyframes.grid
+        found = self.agreement(k, self._graph.targets(k)) if self._enabled else None
+        if found is None:
+            return np.full(grid.num_cells, UNKNOWN, dtype=np.int8)
+        support = found.support(self.robust_scale_px)
+        moving = (found.votes >= _SURE_VOTES) & (2 * support <= found.votes)
+        static = (support >= _SURE_VOTES) & ~moving
+        if moving.sum() > _MAX_MOVING * max(1, int((moving | static).sum())):
+            moving[:] = False
+        labels = np.where(moving, MOVING, np.where(static, STATIC, UNKNOWN))
+        return np.asarray(labels, dtype=np.int8)
 
     def reliable(self, k: int, new: int | None = None) -> NDArray[np.bool_]:
         """(P,) bool, static cells of keyframe `k` whose depth most of its views explain, leaving out the view `new`.

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from vipe_core.geometry.arrays import interpolate_trajectory
 from vipe_core.slam.adjustment import TRACK, Adjuster
 from vipe_core.slam.bootstrap import POSE_ONLY
-from vipe_core.slam.consensus import consensus_pose
+from vipe_core.slam.consensus import MAJORITY, consensus_pose
 from vipe_core.slam.masks import MotionMasks
 from vipe_core.slam.measuring import MeasuredGraph
 from vipe_core.slam.proximity import close_pairs
@@ -19,8 +19,6 @@ from vipe_core.slam.settings import SlamSettings
 _MAX_VELOCITY_RATIO = 1.5
 # Robust cost as a share of the largest possible below which a pose needs no second start.
 _GOOD_FIT = 0.1
-# Share of the picture that must agree on a pose.
-_MAJORITY = 0.5
 
 
 class Tracker:
@@ -86,7 +84,7 @@ class Tracker:
             [self._masks.reliable(i, k) for i in older],
             self._masks.robust_scale_px,
         )
-        if found is None or found[1] < _MAJORITY:
+        if found is None or found[1] < MAJORITY:
             return False
         self._keyframes.set_pose(k, found[0])
         return True
