@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from vipe_core.ba.problem import Result
 from vipe_core.slam.adjustment import REFINE, SETTLE, Adjuster, Step
+from vipe_core.slam.centring import refine_principal_point
 from vipe_core.slam.closing import LoopCloser
 from vipe_core.slam.masks import MotionMasks
 from vipe_core.slam.measuring import MeasuredGraph
@@ -113,6 +114,20 @@ class Backend:
         seen = np.minimum(there.overlap, back.overlap) >= self._settings.wide_overlap
         return [edge for (i, j), keep in zip(pairs, seen, strict=True) if keep for edge in ((i, j), (j, i))]
 
+    def recentre(self) -> bool:
+        """Find the principal point of the adjusted map, and adjust again where it moved; returns whether it did.
+
+        Large moving things that no mask holds could pay for any move, so with them the centre of the image stays.
+        """
+        graph = self._measured.graph
+        if graph.area_votes or not refine_principal_point(self._keyframes, graph, self._adjuster):
+            return False
+        self._adjust()
+        if self._mask_moving():
+            self._adjust()
+        self._keyframes.normalise_scale()
+        return True
+
     def _connect_loops(self) -> None:
         count = len(self._keyframes)
         limit = max(1, round(self._settings.loop_edges_per_keyframe * count))
@@ -125,7 +140,7 @@ class Backend:
             self._settings.proximity_px * scale,
             self._settings.proximity_overlap,
         )
-        existing = sum(1 for i, j in self._measured.graph if i - j > self._settings.neighbours)
+        existing = sum(1 for i, j in self._measured.graph if i - j > self._settings.neighbours + 1)
         for pair in loop_edges(pairs, self._measured.graph, limit - existing):
             self._measured.connect(pair.target, pair.source, guided=True, min_consistent=self._settings.min_consistent)
 

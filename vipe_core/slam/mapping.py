@@ -155,6 +155,12 @@ class ShotMapper:
             if turned is not None:
                 motion, focal, fitter = "rotation", turned, candidate
                 found = examine(reprojector, keyframes, graph, adjuster.robust_scale_px)
+        if motion == "general":
+            with self._clock("backend"):
+                moved = backend.recentre()
+            if moved:
+                focal = backend.focal
+                found = examine(reprojector, keyframes, graph, adjuster.robust_scale_px)
         usable = keyframes.statics()
         labels = np.full(usable.shape, UNKNOWN, dtype=np.int8)
         if motion == "general":

@@ -47,13 +47,15 @@ class Tracker:
         start = self._predict(time_s)
         self._keyframes.append(keyframe, time_s, start, self._keyframes.depth(k - 1))
         # The step to the previous keyframe is within the matcher's own reach, and the prediction may be wrong.
-        self._measured.connect(k - 1, k, guided=False)
+        consistent = self._measured.connect(k - 1, k, guided=False)
         if not self._pose_by_consensus(k):
             self._pose_from_previous(k)
         self._keyframes.set_depth(k, splat_inverse_depth(self._reprojector, self._keyframes, k - 1, k))
-        for i in range(max(0, k - self._settings.neighbours), k - 1):
+        # Across wide steps a point is seen in few keyframes: a link further back helps to hand on the scale.
+        reach = self._settings.neighbours + (consistent < _WIDE_STEP)
+        for i in range(max(0, k - reach), k - 1):
             self._measured.connect(i, k, guided=True)
-        self._connect_returning(k)
+        self._connect_returning(k, reach)
         # What looks right from the step before may not from further away.
         self._pose_by_consensus(k)
         oldest = max(0, k - self._settings.window + 1)
@@ -115,10 +117,10 @@ class Tracker:
                 break
         self._keyframes.set_pose(k, starts[0] if best is None else best[1])
 
-    def _connect_returning(self, k: int) -> None:
+    def _connect_returning(self, k: int, reach: int) -> None:
         """One more edge to the window's nearest older view, when the camera has come back to it."""
         oldest = max(0, k - self._settings.window + 1)
-        older = range(oldest, k - self._settings.neighbours)
+        older = range(oldest, k - reach)
         pairs = close_pairs(
             self._reprojector, self._keyframes, [k], older, self._near_px, self._settings.proximity_overlap
         )
