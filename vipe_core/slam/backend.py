@@ -33,6 +33,8 @@ _VISIBLE_CHANGE = 0.02
 # The second sharpening starts from depths that know the distortion of the patches better.
 _SHARPENINGS = 2
 _SUBSAMPLE = 4
+# The principal point couples with rotation and position, so that one round of probes only comes near.
+_MAX_CENTRINGS = 3
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,11 +122,16 @@ class Backend:
         Large moving things that no mask holds could pay for any move, so with them the centre of the image stays.
         """
         graph = self._measured.graph
-        if graph.area_votes or not refine_principal_point(self._keyframes, graph, self._adjuster):
+        if graph.area_votes:
             return False
-        self._adjust()
-        if self._mask_moving():
+        rounds = 0
+        while rounds < _MAX_CENTRINGS and refine_principal_point(self._keyframes, graph, self._adjuster):
+            rounds += 1
             self._adjust()
+            if self._mask_moving():
+                self._adjust()
+        if rounds == 0:
+            return False
         self._keyframes.normalise_scale()
         return True
 

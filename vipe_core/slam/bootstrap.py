@@ -105,7 +105,8 @@ class Bootstrap:
         for keyframe, time_s in zip(first, times_s, strict=True):
             self._keyframes.append(keyframe, time_s, np.eye(4), np.ones(self._keyframes.grid.num_cells))
         for k in range(1, len(first)):
-            for i in range(max(0, k - self._neighbours), k):
+            consistent = self._measured.connect(k - 1, k, guided=False)
+            for i in range(max(0, k - self._measured.reach(consistent, self._neighbours)), k - 1):
                 self._measured.connect(i, k, guided=False)
         if len(first) > 1:
             self._start()

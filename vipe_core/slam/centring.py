@@ -29,7 +29,7 @@ _PROBE_RATIO = 0.01
 _SIGMA_RATIO = 0.015
 _MAX_RATIO = 0.04
 # Least share of the cost that a move must save.
-_MIN_GAIN = 0.01
+_MIN_GAIN = 0.005
 
 
 def refine_principal_point(keyframes: KeyframeMap, graph: Graph, adjuster: Adjuster) -> bool:

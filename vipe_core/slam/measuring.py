@@ -16,6 +16,8 @@ from vipe_core.slam.reprojection import Reprojector
 # A pair with less forward-backward consistency than this may have been matched from the wrong start.
 _SURE = 0.5
 _MIN_POINTS = 20
+# A step to the previous keyframe that is matched with less consistency than this is wide.
+_WIDE_STEP = 0.7
 
 
 class MeasuredGraph:
@@ -79,6 +81,13 @@ class MeasuredGraph:
                 if _measured(*again) > _measured(there, back):
                     there, back = again
         return self._file(i, j, there, back, min_consistent)
+
+    def reach(self, consistent: float, neighbours: int) -> int:
+        """How many keyframes back to link one whose step from the previous one was matched with this consistency.
+
+        Across wide steps a point is seen in few keyframes: a link further back helps to hand on the scale.
+        """
+        return neighbours + (consistent < _WIDE_STEP)
 
     def connect_by_points(self, i: int, j: int, min_consistent: float) -> float:
         """Measure i -> j and j -> i wherever the cameras are, from sparse correspondences; 0 when there are too few."""

@@ -51,8 +51,7 @@ class Tracker:
         if not self._pose_by_consensus(k):
             self._pose_from_previous(k)
         self._keyframes.set_depth(k, splat_inverse_depth(self._reprojector, self._keyframes, k - 1, k))
-        # Across wide steps a point is seen in few keyframes: a link further back helps to hand on the scale.
-        reach = self._settings.neighbours + (consistent < _WIDE_STEP)
+        reach = self._measured.reach(consistent, self._settings.neighbours)
         for i in range(max(0, k - reach), k - 1):
             self._measured.connect(i, k, guided=True)
         self._connect_returning(k, reach)
