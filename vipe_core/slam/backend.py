@@ -35,6 +35,7 @@ _SHARPENINGS = 2
 _SUBSAMPLE = 4
 # The principal point couples with rotation and position, so that one round of probes only comes near.
 _MAX_CENTRINGS = 3
+_MOSTLY_STATIC = 0.8
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,16 +120,16 @@ class Backend:
     def recentre(self) -> bool:
         """Find the principal point of the adjusted map, and adjust again where it moved; returns whether it did.
 
-        Large moving things that no mask holds could pay for any move, so with them the centre of the image stays.
+        What moves and is not masked could pay for any move: beside large moving things the centre stays.
         """
-        graph = self._measured.graph
-        if graph.area_votes:
+        if float(self._keyframes.statics().mean()) < _MOSTLY_STATIC:
             return False
+        everything = range(len(self._keyframes))
         rounds = 0
-        while rounds < _MAX_CENTRINGS and refine_principal_point(self._keyframes, graph, self._adjuster):
+        while rounds < _MAX_CENTRINGS and refine_principal_point(self._keyframes, self._measured.graph, self._adjuster):
             rounds += 1
             self._adjust()
-            if self._mask_moving():
+            if self._masks.update(everything) > _VISIBLE_CHANGE:
                 self._adjust()
         if rounds == 0:
             return False
