@@ -117,13 +117,13 @@ class Backend:
         seen = np.minimum(there.overlap, back.overlap) >= self._settings.wide_overlap
         return [edge for (i, j), keep in zip(pairs, seen, strict=True) if keep for edge in ((i, j), (j, i))]
 
-    def recentre(self) -> bool:
-        """Find the principal point of the adjusted map, and adjust again where it moved; returns whether it did.
+    def recentre(self) -> None:
+        """Find the principal point of the adjusted map, and adjust again where it moved.
 
         What moves and is not masked could pay for any move: beside large moving things the centre stays.
         """
         if float(self._keyframes.statics().mean()) < _MOSTLY_STATIC:
-            return False
+            return
         everything = range(len(self._keyframes))
         rounds = 0
         while rounds < _MAX_CENTRINGS and refine_principal_point(self._keyframes, self._measured.graph, self._adjuster):
@@ -131,10 +131,7 @@ class Backend:
             self._adjust()
             if self._masks.update(everything) > _VISIBLE_CHANGE:
                 self._adjust()
-        if rounds == 0:
-            return False
         self._keyframes.normalise_scale()
-        return True
 
     def _connect_loops(self) -> None:
         count = len(self._keyframes)

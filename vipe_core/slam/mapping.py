@@ -144,6 +144,7 @@ class ShotMapper:
             backend.run()
             adjuster.alive = lambda: None
             loops = examine_loops(reprojector, keyframes, graph, before, settings.neighbours)
+            backend.recentre()
             backend.sharpen()
         found = examine(reprojector, keyframes, graph, adjuster.robust_scale_px)
         motion: Motion = "static" if static else "general"
@@ -154,12 +155,6 @@ class ShotMapper:
                 turned = self._rotation_only(candidate, keyframes, graph, prior, found)
             if turned is not None:
                 motion, focal, fitter = "rotation", turned, candidate
-                found = examine(reprojector, keyframes, graph, adjuster.robust_scale_px)
-        if motion == "general":
-            with self._clock("backend"):
-                moved = backend.recentre()
-            if moved:
-                focal = backend.focal
                 found = examine(reprojector, keyframes, graph, adjuster.robust_scale_px)
         usable = keyframes.statics()
         labels = np.full(usable.shape, UNKNOWN, dtype=np.int8)
