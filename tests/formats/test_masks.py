@@ -50,14 +50,14 @@ def test_an_annotation_has_a_mask_for_every_frame_and_phrases(tmp_path: Path) ->
 
 
 def test_what_is_no_archive_of_masks_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(FormatError, match="no such mask archive"):
+    with pytest.raises(FormatError, match="no such archive of masks"):
         MaskZipReader(tmp_path / "none.zip")
     (tmp_path / "text.zip").write_text("no zip")
     with pytest.raises(FormatError, match="not a readable zip"):
         MaskZipReader(tmp_path / "text.zip")
     with zipfile.ZipFile(tmp_path / "gap.zip", "w") as archive:
         archive.writestr("00001.png", b"")
-    with pytest.raises(FormatError, match="00000"):
+    with pytest.raises(FormatError, match="masks are missing"):
         MaskZipReader(tmp_path / "gap.zip")
     with zipfile.ZipFile(tmp_path / "noise.zip", "w") as archive:
         archive.writestr("00000.png", b"no picture")
