@@ -9,19 +9,15 @@ poses and depths predict, so that perspective does not pull at it. Brightness ma
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Callable
-from typing import TypeVar
 
 import cv2
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from vipe_core.ba.problem import Grid
+from vipe_core.compilation import compiled
 from vipe_core.priors.classical.features import STRIDE, Array, FlowFeatures, sample_px
 from vipe_core.priors.protocols import Match
-
-F = TypeVar("F", bound=Callable[..., object])
 
 _RADIUS_PX = 8
 _BLUR_PX = 0.8
@@ -37,12 +33,6 @@ _NOISE_TO_FLOOR = 5.0
 _LEAST_CERTAINTY = 0.02
 # Share of a patch's own variance that may be left before the alignment is worth nothing.
 _MAX_LEFT = 0.5
-
-
-def _compiled(function: F) -> F:
-    """Without parallel loops or reordered arithmetic: the same bytes on every run. Releases the GIL."""
-    result: F = njit(cache=True, nogil=True, error_model="numpy", fastmath=False)(function)
-    return result
 
 
 def _pattern() -> NDArray[np.int32]:
@@ -165,7 +155,7 @@ def _certainty(information: NDArray[np.float32], residual: NDArray[np.float32]) 
     return np.asarray(certainty * explained[:, None])
 
 
-@_compiled
+@compiled
 def _align(
     source: Array,
     target: Array,
