@@ -24,6 +24,13 @@ def test_recovers_the_similarity(seed: int, scale: float) -> None:
     np.testing.assert_allclose(found.matrix, truth.matrix, atol=1e-8 * (1 + scale))
 
 
+@given(st.integers(0, 1000), st.floats(1e-2, 1e2))
+def test_products_and_inverses_are_those_of_the_matrices(seed: int, scale: float) -> None:
+    first, second = similarity(seed, scale), similarity(seed + 1, 1.5)
+    np.testing.assert_allclose((first @ second).matrix, first.matrix @ second.matrix, atol=1e-9 * (1 + scale))
+    np.testing.assert_allclose((first @ first.inverse()).matrix, np.eye(4), atol=1e-9)
+
+
 def test_without_scale_it_is_rigid() -> None:
     truth = similarity(3, 2.0)
     src = np.random.default_rng(0).normal(size=(20, 3))

@@ -20,7 +20,7 @@ from vipe_core.slam.guessing import displacement_guess
 from vipe_core.slam.keyframes import KeyframeMap
 from vipe_core.slam.measuring import MeasuredGraph
 from vipe_core.slam.places import similarity
-from vipe_core.slam.posegraph import SimLink, product, relax
+from vipe_core.slam.posegraph import SimLink, relax
 from vipe_core.slam.selection import Keyframe
 from vipe_core.slam.settings import SlamSettings
 
@@ -78,7 +78,7 @@ class Drifted:
         for k in range(count):
             if k > 0:
                 step = self.truth[k] @ inverse(self.truth[k - 1])
-                node = product(Sim3(scale_per_step, drift @ step[:3, :3], step[:3, 3]), node)
+                node = Sim3(scale_per_step, drift @ step[:3, :3], step[:3, 3]) @ node
             pose = np.eye(4)
             pose[:3, :3], pose[:3, 3] = node.rotation, node.translation / node.scale
             self.keyframes.append(Keyframe(k, k), k / 30.0, pose, self.scene.inverse_depth[k] * node.scale)
@@ -159,10 +159,10 @@ def nodes_on_a_circle(count: int) -> list[Sim3]:
 def test_a_pose_graph_without_contradiction_comes_out_exact(drift: float) -> None:
     truth = nodes_on_a_circle(12)
     pairs = [(k, k + 1) for k in range(11)] + [(0, 11), (2, 9)]
-    links = [SimLink(i, j, product(truth[j], truth[i].inverse()), 1.0) for i, j in pairs]
+    links = [SimLink(i, j, truth[j] @ truth[i].inverse(), 1.0) for i, j in pairs]
     rng = np.random.default_rng(0)
     start = truth[:1] + [
-        product(Sim3(drift, Rotation.from_rotvec(rng.normal(0, 0.1, 3)).as_matrix(), rng.normal(0, 0.1, 3)), node)
+        Sim3(drift, Rotation.from_rotvec(rng.normal(0, 0.1, 3)).as_matrix(), rng.normal(0, 0.1, 3)) @ node
         for node in truth[1:]
     ]
     for found, node in zip(relax(start, links), truth, strict=True):

@@ -43,6 +43,10 @@ class Sim3:
         target_from_body[..., :3, 3] = self.apply(source_from_body[..., :3, 3])
         return target_from_body
 
+    def __matmul__(self, other: Sim3) -> Sim3:
+        """target_from_source @ source_from_other: `self` after `other`."""
+        return Sim3(self.scale * other.scale, self.rotation @ other.rotation, self.apply(other.translation))
+
     def inverse(self) -> Sim3:
         """source_from_target."""
         return Sim3(1 / self.scale, self.rotation.T, -(self.rotation.T @ self.translation) / self.scale)

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from vipe_core.geometry.sim3 import Sim3
 from vipe_core.slam.adjustment import REFINE, Adjuster
+from vipe_core.slam.consensus import pinhole_camera
 from vipe_core.slam.measuring import MeasuredGraph
 from vipe_core.slam.places import similarity
 from vipe_core.slam.posegraph import SimLink, relax
@@ -214,25 +215,16 @@ class LoopCloser:
         cells = np.flatnonzero((match.weight.max(axis=1) > _MIN_WEIGHT) & self._keyframes.static(i))
         if len(cells) < _MIN_CELLS:
             return None
-        fx, fy, cx, cy = (float(value) for value in self._keyframes.intrinsics)
-        grid = self._keyframes.grid
-        source = grid.sample_px().numpy()[cells].astype(np.float64)
-        rays = np.concatenate([(source - (cx, cy)) / (fx, fy), np.ones((len(cells), 1))], axis=1)
+        rays = self._reprojector.rays(self._keyframes.intrinsics)[cells]
         points = rays / np.maximum(self._keyframes.depth(i)[cells, None].astype(np.float64), 1e-6)
-        camera = {
-            "model": "PINHOLE",
-            "width": int(grid.width * grid.stride),
-            "height": int(grid.height * grid.stride),
-            "params": [fx, fy, cx, cy],
-        }
         found, report = poselib.estimate_absolute_pose(
-            match.target_px[cells].astype(np.float64), points, camera, dict(_RESECTION), {}
+            match.target_px[cells].astype(np.float64), points, pinhole_camera(self._keyframes), dict(_RESECTION), {}
         )
         pose = np.eye(4)
         pose[:3, :3], pose[:3, 3] = found.R, found.t
         if not np.isfinite(pose).all() or float(report["inlier_ratio"]) < _MIN_RIGID:
             return None
-        inlier = np.zeros(grid.num_cells, dtype=np.bool_)
+        inlier = np.zeros(self._keyframes.grid.num_cells, dtype=np.bool_)
         inlier[cells[np.asarray(report["inliers"], dtype=np.bool_)]] = True
         return pose, inlier
 

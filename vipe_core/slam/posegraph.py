@@ -52,11 +52,6 @@ def relax(nodes: Sequence[Sim3], links: Sequence[SimLink]) -> list[Sim3]:
     return current
 
 
-def product(first: Sim3, second: Sim3) -> Sim3:
-    """`first` after `second`."""
-    return Sim3(first.scale * second.scale, first.rotation @ second.rotation, first.apply(second.translation))
-
-
 def _step(nodes: Sequence[Sim3], links: Sequence[SimLink]) -> NDArray[np.float64]:
     """(K, 7) left perturbations of the nodes.
 
@@ -70,8 +65,8 @@ def _step(nodes: Sequence[Sim3], links: Sequence[SimLink]) -> NDArray[np.float64
     block = np.repeat(np.arange(7), 7), np.tile(np.arange(7), 7)
     for row, link in enumerate(links):
         root = float(np.sqrt(link.weight))
-        between = product(nodes[link.target], nodes[link.source].inverse())
-        error = product(between, link.target_from_source.inverse())
+        between = nodes[link.target] @ nodes[link.source].inverse()
+        error = between @ link.target_from_source.inverse()
         errors[7 * row : 7 * row + 7] = root * np.concatenate(
             [error.translation, Rotation.from_matrix(error.rotation).as_rotvec(), [np.log(error.scale)]]
         )
@@ -89,7 +84,7 @@ def _step(nodes: Sequence[Sim3], links: Sequence[SimLink]) -> NDArray[np.float64
 
 def _moved(node: Sim3, twist: NDArray[np.float64]) -> Sim3:
     turn = Rotation.from_rotvec(twist[3:6]).as_matrix()
-    return product(Sim3(float(np.exp(twist[6])), turn, twist[:3]), node)
+    return Sim3(float(np.exp(twist[6])), turn, twist[:3]) @ node
 
 
 def _adjoint(transform: Sim3) -> NDArray[np.float64]:

@@ -160,10 +160,11 @@ class _Pass:
         self.shot_of: dict[int, int] = {}
 
     def place(self, placed: list[Placed]) -> None:
-        for picture, cut in ((one.picture, one.cut) for one in placed):
-            if cut:
+        for one in placed:
+            picture = one.picture
+            if one.cut:
                 self.cuts.append(picture.index)
-            if cut or not self.filters:
+            if one.cut or not self.filters:
                 self.filters.append(_MotionFilter(self._matcher, self._threshold_px))
             self.shot_of[picture.index] = len(self.filters) - 1
             self.filters[-1].add(Keyframe(picture.index, picture.features))
