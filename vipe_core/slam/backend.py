@@ -35,7 +35,6 @@ _SHARPENINGS = 2
 _SUBSAMPLE = 4
 # The principal point couples with rotation and position, so that one round of probes only comes near.
 _MAX_CENTRINGS = 3
-_MOSTLY_STATIC = 0.8
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,12 +117,7 @@ class Backend:
         return [edge for (i, j), keep in zip(pairs, seen, strict=True) if keep for edge in ((i, j), (j, i))]
 
     def recentre(self) -> None:
-        """Find the principal point of the adjusted map, and adjust again where it moved.
-
-        What moves and is not masked could pay for any move: beside large moving things the centre stays.
-        """
-        if float(self._keyframes.statics().mean()) < _MOSTLY_STATIC:
-            return
+        """Find the principal point of the adjusted map, and adjust again where it moved."""
         everything = range(len(self._keyframes))
         rounds = 0
         while rounds < _MAX_CENTRINGS and refine_principal_point(self._keyframes, self._measured.graph, self._adjuster):
