@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from vipe_core.geometry.arrays import inverse
 from vipe_core.priors.protocols import Match
-from vipe_core.slam.consensus import agree, consensus_pose, triangulate
+from vipe_core.slam.consensus import agree, consensus_pose
 from vipe_core.slam.graph import Graph
 from vipe_core.slam.keyframes import KeyframeMap
 from vipe_core.slam.masks import MotionMasks
@@ -41,14 +41,17 @@ def placed_map(scene: ExactScene, count: int) -> KeyframeMap:
     return keyframes
 
 
-def test_triangulation_inverts_reprojection() -> None:
+def test_one_view_gives_the_depth_that_its_measurement_triangulates_to_and_none_without_a_baseline() -> None:
     scene = ExactScene(SIDEWAYS)
-    relative = SIDEWAYS[2] @ inverse(SIDEWAYS[0])
-    found = triangulate(scene.reprojector, scene.params, relative, scene.measure(0, 2).target_px)
-    np.testing.assert_allclose(found, scene.inverse_depth[0], rtol=1e-4)
-    turned = relative.copy()
-    turned[:3, 3] = 0
-    assert np.isnan(triangulate(scene.reprojector, scene.params, turned, scene.measure(0, 2).target_px)).all()
+    relative = (SIDEWAYS[2] @ inverse(SIDEWAYS[0]))[None]
+    match = scene.measure(0, 2)
+    found = agree(scene.reprojector, scene.params, relative, [match], 3.0)
+    np.testing.assert_allclose(found.inverse_depth, scene.inverse_depth[0], rtol=1e-4)
+    assert found.error_px[found.measured].max() < 1e-3
+    relative[0, :3, 3] = 0
+    turned = agree(scene.reprojector, scene.params, relative, [match], 3.0)
+    assert np.isnan(turned.inverse_depth).all()
+    assert np.isinf(turned.error_px).all()
 
 
 def test_views_agree_on_the_true_depth_in_spite_of_one_that_is_wrong() -> None:

@@ -18,9 +18,10 @@ import numpy as np
 import poselib
 from numpy.typing import NDArray
 
+from vipe_core.compilation import compiled
 from vipe_core.priors.protocols import Match
 from vipe_core.slam.keyframes import KeyframeMap
-from vipe_core.slam.reprojection import Reprojector
+from vipe_core.slam.reprojection import MIN_DEPTH_RATIO, Reprojector
 
 Array = NDArray[Any]
 
@@ -30,6 +31,8 @@ MIN_WEIGHT = 0.02
 MAJORITY = 0.5
 """Share of the cells that must agree on a pose for it to be believed."""
 
+# Squared sine between the baseline and a ray, in units of the squared baseline, below which no depth follows.
+_NO_BASELINE = 1e-18
 _MIN_POINTS = 50
 _MAX_POINTS = 1500
 
@@ -73,55 +76,113 @@ def agree(
     proposal with the lowest truncated cost over all views wins.
 
     Args:
+        intrinsics: (4,) index parameters of a pinhole.
         target_from_source: (E, 4, 4), one per match; at least one.
         threshold_px: Where the cost of a measurement is cut off.
         current: (P,) inverse depth, or None.
     """
-    relative = np.asarray(target_from_source, dtype=np.float64)
-    target_px = np.stack([match.target_px for match in matches]).astype(np.float64)
-    weight = np.stack([match.weight for match in matches])
-    strongest = weight.max(axis=2)
-    measured = strongest > MIN_WEIGHT
-    # Along an edge of the picture the flow is not measured: that component counts by its share, as in the adjustment.
-    share = weight / np.maximum(strongest, 1e-12)[..., None]
-    proposals = [triangulate(reprojector, intrinsics, pose, px) for pose, px in zip(relative, target_px, strict=True)]
-    if current is not None:
-        proposals.append(np.asarray(current, dtype=np.float64))
-    best_cost = np.full(measured.shape[1], np.inf)
-    best = np.full(measured.shape[1], np.nan)
-    best_error = np.full(measured.shape, np.inf)
-    for proposal in proposals:
-        possible = np.isfinite(proposal) & (proposal > 0)
-        depth = np.where(possible, proposal, 0.0)
-        induced = reprojector.induced(intrinsics, relative, np.tile(depth, (len(measured), 1)))
-        error = induced.target_px - target_px
-        seen = measured & np.isfinite(error).all(axis=2)
-        error_px = np.where(seen, np.sqrt((share * np.square(np.nan_to_num(error))).sum(axis=2)), np.inf)
-        cost = np.where(measured, np.minimum(error_px / threshold_px, 1.0) ** 2, 0.0).sum(axis=0)
-        better = possible & (cost < best_cost)
-        best_cost = np.where(better, cost, best_cost)
-        best = np.where(better, depth, best)
-        best_error = np.where(better, error_px, best_error)
-    return Agreement(best.astype(np.float32), measured, best_error.astype(np.float32))
+    relative = np.ascontiguousarray(target_from_source, dtype=np.float64)
+    target_px = np.stack([match.target_px for match in matches]).astype(np.float32, copy=False)
+    weight = np.stack([match.weight for match in matches]).astype(np.float32, copy=False)
+    rays = reprojector.rays(intrinsics)
+    no_current = np.full(len(rays), np.nan)
+    views, cells = weight.shape[:2]
+    best = np.empty(cells, np.float32)
+    measured = np.empty((views, cells), np.bool_)
+    error_px = np.empty((views, cells), np.float32)
+    _agree(
+        np.ascontiguousarray(rays),
+        np.asarray(intrinsics, dtype=np.float64),
+        relative,
+        target_px,
+        weight,
+        no_current if current is None else np.asarray(current, dtype=np.float64),
+        threshold_px,
+        MIN_DEPTH_RATIO,
+        best,
+        measured,
+        error_px,
+    )
+    return Agreement(best, measured, error_px)
 
 
-def triangulate(
-    reprojector: Reprojector, intrinsics: Array, target_from_source: Array, target_px: Array
-) -> NDArray[np.float64]:
-    """(P,) inverse depth along the source rays for which the point is seen at `target_px`.
+@compiled
+def _agree(
+    rays: Array,
+    intrinsics: Array,
+    relative: Array,
+    target_px: Array,
+    weight: Array,
+    current: Array,
+    threshold_px: float,
+    min_depth_ratio: float,
+    best: Array,
+    measured: Array,
+    error_px: Array,
+) -> None:
+    """`agree` cell by cell, for a pinhole.
 
-    The point a + b d (a = R ray, b = t) lies on the target's ray r where r x (a + b d) = 0, least squares in d. It may
-    be negative (behind the camera, or beyond infinity); NaN without a baseline.
+    Along an edge of the picture the flow is not measured: that component counts by its share, as in the adjustment.
     """
-    relative = np.asarray(target_from_source, dtype=np.float64)
-    rays = reprojector.rays(intrinsics) @ relative[:3, :3].T
-    seen = reprojector.rays(intrinsics, target_px)
-    seen = seen / np.linalg.norm(seen, axis=1, keepdims=True)
-    offset = np.cross(seen, rays)
-    slope = np.cross(seen, relative[:3, 3])
-    length = np.square(slope).sum(axis=1)
-    known = length > 1e-18
-    return np.where(known, -(offset * slope).sum(axis=1) / np.where(known, length, 1.0), np.nan)
+    fx, fy, cx, cy = intrinsics[0], intrinsics[1], intrinsics[2], intrinsics[3]
+    views = len(relative)
+    turned = np.empty((views, 3))
+    share = np.empty((views, 2))
+    error, best_error = np.empty(views), np.empty(views)
+    for cell in range(len(rays)):
+        x, y, z = rays[cell, 0], rays[cell, 1], rays[cell, 2]
+        for view in range(views):
+            pose = relative[view]
+            turned[view, 0] = pose[0, 0] * x + pose[0, 1] * y + pose[0, 2] * z
+            turned[view, 1] = pose[1, 0] * x + pose[1, 1] * y + pose[1, 2] * z
+            turned[view, 2] = pose[2, 0] * x + pose[2, 1] * y + pose[2, 2] * z
+            strongest = max(weight[view, cell, 0], weight[view, cell, 1])
+            measured[view, cell] = strongest > MIN_WEIGHT
+            share[view, 0] = weight[view, cell, 0] / max(strongest, 1e-12)
+            share[view, 1] = weight[view, cell, 1] / max(strongest, 1e-12)
+            best_error[view] = np.inf
+        best_cost, best_depth = np.inf, np.nan
+        for proposal in range(views + 1):
+            if proposal == views:
+                depth = current[cell]
+            else:
+                # The point a + b d (a = R ray, b = t) lies on the target's ray r where r x (a + b d) = 0, least
+                # squares in d. It may be negative: behind the camera, or beyond infinity.
+                rx = (target_px[proposal, cell, 0] - cx) / fx
+                ry = (target_px[proposal, cell, 1] - cy) / fy
+                ax, ay, az = turned[proposal, 0], turned[proposal, 1], turned[proposal, 2]
+                bx, by, bz = relative[proposal, 0, 3], relative[proposal, 1, 3], relative[proposal, 2, 3]
+                ox, oy, oz = ry * az - ay, ax - rx * az, rx * ay - ry * ax
+                sx, sy, sz = ry * bz - by, bx - rx * bz, rx * by - ry * bx
+                length = sx * sx + sy * sy + sz * sz
+                if not length > _NO_BASELINE * (rx * rx + ry * ry + 1.0):
+                    continue
+                depth = -(ox * sx + oy * sy + oz * sz) / length
+            if not (depth > 0 and depth < np.inf):
+                continue
+            cost = 0.0
+            for view in range(views):
+                error[view] = np.inf
+                if not measured[view, cell]:
+                    continue
+                px = turned[view, 0] + relative[view, 0, 3] * depth
+                py = turned[view, 1] + relative[view, 1, 3] * depth
+                pz = turned[view, 2] + relative[view, 2, 3] * depth
+                if pz > min_depth_ratio:
+                    du = fx * px / pz + cx - target_px[view, cell, 0]
+                    dv = fy * py / pz + cy - target_px[view, cell, 1]
+                    squared = share[view, 0] * du * du + share[view, 1] * dv * dv
+                    if squared < np.inf:
+                        error[view] = math.sqrt(squared)
+                cost += min(error[view] / threshold_px, 1.0) ** 2
+                if not cost < best_cost:
+                    break
+            if cost < best_cost:
+                best_cost, best_depth = cost, depth
+                best_error[:] = error
+        best[cell] = best_depth
+        for view in range(views):
+            error_px[view, cell] = best_error[view]
 
 
 def consensus_pose(

@@ -19,7 +19,8 @@ from vipe_core.slam.keyframes import KeyframeMap
 
 Array = NDArray[Any]
 
-_MIN_DEPTH_RATIO = 0.1
+MIN_DEPTH_RATIO = 0.1
+"""A point nearer to the target camera than this share of its depth in the source has no usable image there."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,7 +83,7 @@ class Reprojector:
         target_px, valid = project(self._model, params, points)
         # The homogeneous scale starts at |ray|; what is left of it is the ratio of the depths.
         length = points[..., 2] if self._model == "pinhole" else points.norm(dim=-1)
-        valid = valid & (length > _MIN_DEPTH_RATIO)
+        valid = valid & (length > MIN_DEPTH_RATIO)
         inside = ((target_px >= 0) & (target_px <= self._size)).all(-1)
         nan = torch.full_like(target_px, torch.nan)
         target_px = torch.where(valid[..., None], target_px, nan)
