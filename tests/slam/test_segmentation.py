@@ -5,6 +5,9 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
 from numpy.typing import NDArray
 
 from vipe_core.ba.problem import Grid
@@ -47,6 +50,27 @@ def test_specks_and_a_static_picture_make_no_mask() -> None:
     assert not segment(rgb, labels, GRID).any()
     assert not segment(rgb, np.full(GRID.num_cells, UNKNOWN), GRID).any()
     assert not segment(rgb, np.where(labels_of(thing) == MOVING, UNKNOWN, STATIC), GRID).any()
+
+
+def test_a_thin_strip_and_a_picture_that_moves_as_a_whole_make_no_mask() -> None:
+    rgb, _ = picture()
+    labels = np.full((24, 32), STATIC)
+    labels[10:12, 8:16] = MOVING
+    assert not segment(rgb, labels.reshape(-1), GRID).any()
+    labels = np.full((24, 32), MOVING)
+    labels[10, 8] = STATIC
+    assert not segment(rgb, labels.reshape(-1), GRID).any()
+
+
+@settings(max_examples=50)
+@given(
+    hnp.arrays(np.int8, (6, 8), elements=st.sampled_from([MOVING, UNKNOWN, STATIC])),
+    st.sampled_from([0, 128, 255]),
+)
+def test_any_labels_of_a_plain_picture_give_a_mask(labels: NDArray[Any], level: int) -> None:
+    mask = segment(np.full((48, 64, 3), level, np.uint8), labels.reshape(-1), Grid(6, 8))
+    assert mask.shape == (48, 64)
+    assert mask.max() <= 1
 
 
 def test_labels_travel_with_their_measurements() -> None:

@@ -58,6 +58,10 @@ def segment(rgb: NDArray[np.uint8], labels: Array, grid: Grid) -> NDArray[np.uin
     trimap = np.where(leaning > 0, cv2.GC_PR_FGD, cv2.GC_PR_BGD).astype(np.uint8)
     trimap[(cells == STATIC) & (moving == 0)] = cv2.GC_BGD
     trimap[cv2.erode(moving, np.ones((3, 3), np.uint8)) > 0] = cv2.GC_FGD
+    foreground = (trimap == cv2.GC_FGD) | (trimap == cv2.GC_PR_FGD)
+    if not foreground.any() or foreground.all():
+        # A strip too thin to hold its ground among static cells, or nothing left to hold anything against.
+        return nothing
     size = (_DETAIL * grid.width, _DETAIL * grid.height)
     fine = cv2.resize(trimap, size, interpolation=cv2.INTER_NEAREST)
     small = np.ascontiguousarray(cv2.resize(rgb, size, interpolation=cv2.INTER_AREA))
