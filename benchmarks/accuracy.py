@@ -7,7 +7,8 @@ every sequence that something is asked of. Ours is made anew (poses and intrinsi
 ROOT (ViPE's layout, under the sequence's name or that of its pictures), with depth then. The trivial answer is a camera
 that never moves, a field of view of 60 degrees and the same depth everywhere; for artifacts the `x` columns say how
 many times smaller our errors are. With --peers, COLMAP gets the same frames of the sequences that are measured against
-it, and its better mapper is shown; --cache keeps its results. Depth errors are of static pixels after one median scale.
+it, and its better mapper is shown; --cache keeps its results. Depth errors are of static pixels after one median scale;
+the IoU of the masks is of all moving pixels, where the truth has any.
 The status is 1 when something that is asked is not met.
 """
 
@@ -225,7 +226,7 @@ def _table(with_depth: bool) -> Table:
     table = Table(title="Accuracy against ground truth")
     headings = ["sequence", "posed", "ATE %", "RTE %", "RRE deg", "rot deg", "FOV", "true", "off"]
     if with_depth:
-        headings += ["AbsRel", "logRMSE", "d1.25", "depth/pose", "x ATE", "x FOV", "x AbsRel"]
+        headings += ["AbsRel", "logRMSE", "d1.25", "depth/pose", "mask IoU", "x ATE", "x FOV", "x AbsRel"]
     headings += ["verdict", "CPU-s/frame", "asked: at most", "met"]
     for heading in headings:
         words = heading in ("sequence", "verdict", "asked: at most", "met")
@@ -259,7 +260,7 @@ def _add_rows(
     met = "" if not checks else f"no: {', '.join(misses)}" if misses else "yes"
     asked = ", ".join(text for text, _ in checks)
     table.add_row(name, *cells, ours.verdict, _number(ours.cpu_s_per_frame), asked, met)
-    depth_columns = 7 if with_depth else 0
+    depth_columns = 8 if with_depth else 0
     if peer is not None:
         run = peer.run
         cells = [f"{len(run.frame_index)}/{run.num_frames}", *_pose_cells(peer.report, run.camera, true_fov)]
@@ -289,6 +290,7 @@ def _depth_cells(report: SequenceReport) -> list[str]:
         _number(depth.log_rmse if depth else None, 3),
         _number(depth.delta125 if depth else None, 3),
         _number(report.depth_pose_ratio, 3),
+        _number(report.mask.iou if report.mask else None, 3),
     ]
 
 

@@ -21,6 +21,7 @@ from vipe_core.evaluation.metrics import (
     convert_depth,
     depth_errors,
     depth_pose_scale_ratio,
+    mask_errors,
     sample_depth,
     trajectory_errors,
     z_from_ray,
@@ -283,3 +284,31 @@ def test_depth_beyond_the_limit_is_not_judged() -> None:
     )
     assert far is not None
     assert far.abs_rel == pytest.approx((70 - 50) / 50 / 3)
+
+
+def test_masks_by_hand() -> None:
+    truth = np.zeros((4, 4), np.bool_)
+    truth[:, :2] = True
+    mask = np.zeros((8, 8), np.uint8)  # twice the size, one column to the right
+    mask[:, 2:6] = 3
+    errors = mask_errors([(mask, truth)])
+    assert errors is not None
+    assert errors.iou == pytest.approx(4 / 12)
+    assert errors.recall == pytest.approx(0.5)
+    assert errors.false_alarms == pytest.approx(0.5)
+    # Pixels of all frames weigh the same: a second frame that is right halves the errors.
+    second = mask_errors([(mask, truth), (truth.astype(np.uint8), truth)])
+    assert second is not None
+    assert second.iou == pytest.approx(12 / 20)
+    assert second.false_alarms == pytest.approx(0.25)
+
+
+def test_masks_where_nothing_or_everything_moves() -> None:
+    still, all_moving = np.zeros((3, 5), np.bool_), np.ones((3, 5), np.bool_)
+    nothing = mask_errors([(still.astype(np.uint8), still)])
+    assert nothing is not None
+    assert (nothing.iou, nothing.recall, nothing.false_alarms) == (None, None, 0.0)
+    everything = mask_errors([(still.astype(np.uint8), all_moving)])
+    assert everything is not None
+    assert (everything.iou, everything.recall, everything.false_alarms) == (0.0, 0.0, None)
+    assert mask_errors([]) is None

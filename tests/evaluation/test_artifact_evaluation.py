@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -39,7 +40,7 @@ def annotation_of(clip: SyntheticClip, name: str, camera: Camera) -> Annotation:
                 rgb,
                 depth[k].astype(np.float32),
                 np.ones(depth[k].shape, np.float32),
-                np.zeros(depth[k].shape, np.uint8),
+                clip.dynamic[k].astype(np.uint8),
             )
 
     count = len(clip.rgb)
@@ -86,6 +87,19 @@ def test_a_perfect_result_scores_perfectly(tmp_path: Path, model: CameraModel) -
     assert report.depth.abs_rel < 0.03
     assert report.depth.delta125 > 0.97
     assert report.depth_pose_ratio == pytest.approx(1.0, abs=0.02)
+    whole = dataclasses.replace(truth_of(clip), dynamic=clip.dynamic)
+    report = evaluate_artifacts(read_artifacts(tmp_path, "perfect"), dataclasses.replace(whole, depth=None))
+    assert report.mask is not None
+    assert (report.mask.iou, report.mask.recall, report.mask.false_alarms) == (1.0, 1.0, 0.0)
+
+
+def test_artifacts_without_masks_are_not_judged_by_them(tmp_path: Path) -> None:
+    clip = tiny_clip("dynamic", 3, 48, 36)
+    write_artifacts(annotation_of(clip, "a", clip.camera), tmp_path)
+    (tmp_path / "mask" / "a.zip").unlink()
+    report = evaluate_artifacts(read_artifacts(tmp_path, "a"), truth_of(clip))
+    assert report.mask is None
+    assert report.depth is not None
 
 
 def test_a_wrong_focal_length_is_seen(tmp_path: Path) -> None:

@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -82,6 +82,21 @@ class CameraErrors:
     fov_x_deg: float
     fov_y_deg: float
     focal_percent: float
+
+
+@dataclass(frozen=True, slots=True)
+class MaskErrors:
+    """How well masks of moving things match the truth, over all pixels of all frames.
+
+    Attributes:
+        iou: Pixels in both masks over pixels in either; None where nothing moves.
+        recall: Share of the moving pixels that are masked; None where nothing moves.
+        false_alarms: Share of the static pixels that are masked; None where everything moves.
+    """
+
+    iou: float | None
+    recall: float | None
+    false_alarms: float | None
 
 
 def trajectory_errors(
@@ -212,6 +227,37 @@ def depth_errors(
         density=len(true) / wanted,
         shift=shift,
     )
+
+
+def mask_errors(pairs: Iterable[tuple[NDArray[Any], NDArray[np.bool_]]]) -> MaskErrors | None:
+    """Compares masks with the truth; None without any frame.
+
+    Args:
+        pairs: For each frame the mask (H, W), non-zero where something moves, and the truth (h, w) at any size; the
+            mask is read at the centres of the truth's pixels.
+    """
+    both = masked = moving = total = 0
+    for mask, truth in pairs:
+        found = sample_mask(mask, *truth.shape)
+        both += int((found & truth).sum())
+        masked += int(found.sum())
+        moving += int(truth.sum())
+        total += truth.size
+    if not total:
+        return None
+    static = total - moving
+    return MaskErrors(
+        iou=both / (masked + moving - both) if moving else None,
+        recall=both / moving if moving else None,
+        false_alarms=(masked - both) / static if static else None,
+    )
+
+
+def sample_mask(mask: NDArray[Any], height: int, width: int) -> NDArray[np.bool_]:
+    """(height, width) bool, what a mask (H, W) of the same picture says at the centres of the pixels of that size."""
+    rows = ((np.arange(height) + 0.5) * mask.shape[0] / height).astype(np.int64)
+    columns = ((np.arange(width) + 0.5) * mask.shape[1] / width).astype(np.int64)
+    return np.asarray(mask[rows[:, None], columns] != 0)
 
 
 def depth_pose_scale_ratio(depth: DepthErrors | None, trajectory: TrajectoryErrors) -> float | None:

@@ -54,6 +54,8 @@ def columns(results: Sequence[SequenceResult], unit: tuple[str, float] = ("m", 1
         Column("log_rmse", "LogRMSE", 3),
         Column("delta125", "delta 1.25 [%]", 1, 100),
         Column("depth_pose_ratio", "depth/pose", 3),
+        Column("mask_iou", "mask IoU [%]", 1, 100),
+        Column("mask_false_alarms", "masked static [%]", 1, 100),
         Column("s_ate", "S-ATE [x1e-2]", 3, 1e2),
         Column("s_rte", "S-RTE [x1e-4]", 3, 1e4),
         Column("s_rre_deg", "S-RRE [deg]", 3),
@@ -73,6 +75,8 @@ _EXPLAINED = {
     "rel_abs": "RelAbs, LogRMSE, delta 1.25: depth of static pixels, all pixels of a sequence weighing the same, after"
     " one alignment per sequence: {alignment}.",
     "depth_pose_ratio": "depth/pose: depth scale over pose scale, 1 when both are in the same units.",
+    "mask_iou": "mask IoU, masked static: masks of moving things against the true ones, all pixels of all frames; the"
+    " share of static pixels that are masked.",
     "s_ate": "S-ATE, S-RTE, S-RRE, S-Focal: the run over the video against the run over its reverse, both paths scaled"
     " to length 1, after a rigid alignment.",
     "sampson_px": "Sampson: distance to the epipolar line, to first order, of matches in consecutive frames; mean over"

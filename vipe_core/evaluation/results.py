@@ -95,6 +95,12 @@ def flat_figures(
                 "depth_density": depth.density,
                 "depth_pose_ratio": report.depth_pose_ratio,
             }
+        if report.mask is not None:
+            figures |= {
+                "mask_iou": report.mask.iou,
+                "mask_recall": report.mask.recall,
+                "mask_false_alarms": report.mask.false_alarms,
+            }
     if shuttle is not None:
         figures |= {
             "s_ate": shuttle.ate,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import zipfile
 from collections.abc import Iterable, Iterator, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
@@ -19,11 +20,13 @@ from vipe_core.evaluation.metrics import (
     CameraErrors,
     DepthAlignment,
     DepthErrors,
+    MaskErrors,
     TrajectoryErrors,
     camera_errors,
     convert_depth,
     depth_errors,
     depth_pose_scale_ratio,
+    mask_errors,
     sample_depth,
     trajectory_errors,
 )
@@ -77,6 +80,8 @@ class Estimate:
         camera: At any resolution of the same pictures.
         depth: M depth maps in order, or None to leave depth out.
         depth_kind: Kind of these.
+        masks: M masks (H, W) in order, non-zero where something moves by itself, or None to leave them out. They are
+            asked for after the last depth map.
     """
 
     name: str
@@ -85,6 +90,7 @@ class Estimate:
     camera: Camera
     depth: Iterable[NDArray[np.float32]] | None = None
     depth_kind: DepthKind = "z"
+    masks: Iterable[NDArray[np.uint8]] | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,6 +100,7 @@ class SequenceReport:
     Attributes:
         coverage: Share of the true frames that the estimate has a pose for.
         depth_pose_ratio: Depth scale over pose scale, 1 when both are in the same units.
+        mask: Of the masks of moving things, where there are any and the truth is known.
     """
 
     coverage: float
@@ -101,6 +108,7 @@ class SequenceReport:
     camera: CameraErrors | None
     depth: DepthErrors | None
     depth_pose_ratio: float | None
+    mask: MaskErrors | None = None
 
 
 def read_truth(path: str | Path) -> GroundTruth:
@@ -130,7 +138,7 @@ def read_truth(path: str | Path) -> GroundTruth:
 def evaluate(
     estimate: Estimate, truth: GroundTruth, alignment: DepthAlignment = "scale", max_depth: float | None = None
 ) -> SequenceReport:
-    """Compares an estimate with the truth; takes one depth map at a time.
+    """Compares an estimate with the truth; takes one depth map and one mask at a time.
 
     Args:
         alignment, max_depth: As in `depth_errors`.
@@ -145,13 +153,16 @@ def evaluate(
     depth = None
     if estimate.depth is not None and truth.depth is not None:
         depth = depth_errors(_depth_pairs(estimate, estimate.depth, truth, rows, camera), alignment, max_depth)
-    return _report(estimate.world_from_cam[rows[:, 0]], camera, depth, truth, rows[:, 1])
+    mask = None
+    if estimate.masks is not None and truth.dynamic is not None:
+        mask = mask_errors(_mask_pairs(estimate.masks, truth.dynamic, rows))
+    return _report(estimate.world_from_cam[rows[:, 0]], camera, depth, mask, truth, rows[:, 1])
 
 
 def evaluate_artifacts(
     artifacts: Artifacts, truth: GroundTruth, alignment: DepthAlignment = "scale", max_depth: float | None = None
 ) -> SequenceReport:
-    """Compares artifacts on disk with the truth; reads one depth map at a time.
+    """Compares artifacts on disk with the truth; reads one depth map and one mask at a time.
 
     Args:
         alignment, max_depth: As in `depth_errors`.
@@ -160,20 +171,20 @@ def evaluate_artifacts(
         FormatError: The artifacts are damaged, or share fewer than two frames with the truth.
     """
 
-    def estimate(depth: Iterable[NDArray[np.float32]] | None) -> Estimate:
-        return Estimate(
+    with ExitStack() as stack:
+        depth = stack.enter_context(artifacts.open_depth()) if artifacts.has_depth and truth.depth is not None else None
+        masked = artifacts.has_mask and truth.dynamic is not None
+        masks = stack.enter_context(artifacts.open_mask()) if masked else None
+        estimate = Estimate(
             artifacts.name,
             artifacts.world_from_cam,
             artifacts.frame_index,
             artifacts.camera,
             depth,
             artifacts.depth_kind,
+            masks,
         )
-
-    if not artifacts.has_depth or truth.depth is None:
-        return evaluate(estimate(None), truth)
-    with artifacts.open_depth() as reader:
-        return evaluate(estimate(reader), truth, alignment, max_depth)
+        return evaluate(estimate, truth, alignment, max_depth)
 
 
 def evaluate_static_guess(truth: GroundTruth, fov_x_deg: float = 60.0) -> SequenceReport:
@@ -189,13 +200,14 @@ def evaluate_static_guess(truth: GroundTruth, fov_x_deg: float = 60.0) -> Sequen
         step = _pixel_step(truth.depth, len(rows))
         maps = (_true_depth(truth, int(row), step) for row in rows)
         depth = depth_errors((np.ones(true.shape, np.float32), true, static) for true, static in maps)
-    return _report(estimate, camera, depth, truth, rows)
+    return _report(estimate, camera, depth, None, truth, rows)
 
 
 def _report(
     estimate: NDArray[np.float64],
     camera: Camera,
     depth: DepthErrors | None,
+    mask: MaskErrors | None,
     truth: GroundTruth,
     rows: NDArray[np.int64],
 ) -> SequenceReport:
@@ -206,6 +218,7 @@ def _report(
         camera=None if truth.camera is None else camera_errors(camera, truth.camera),
         depth=depth,
         depth_pose_ratio=depth_pose_scale_ratio(depth, trajectory),
+        mask=mask,
     )
 
 
@@ -248,3 +261,12 @@ def _depth_pairs(
             continue
         sampled = convert_depth(sample_depth(depth, *shape), lens, estimate.depth_kind, truth.depth_kind)
         yield sampled[::step, ::step], *_true_depth(truth, true_row[k], step)
+
+
+def _mask_pairs(
+    masks: Iterable[NDArray[np.uint8]], dynamic: NDArray[np.bool_], rows: NDArray[np.int64]
+) -> Iterator[tuple[NDArray[np.uint8], NDArray[np.bool_]]]:
+    true_row = dict(rows.tolist())
+    for k, mask in enumerate(masks):
+        if k in true_row:
+            yield mask, np.asarray(dynamic[true_row[k]], dtype=np.bool_)

@@ -28,9 +28,9 @@ from vipe_core.evaluation.consistency import SampsonErrors, sampson_errors, shut
 from vipe_core.evaluation.datasets import SequenceRef, protocol_of
 from vipe_core.evaluation.datasets.sequence import GroundTruthSequence, Pictures
 from vipe_core.evaluation.matching import point_matcher
-from vipe_core.evaluation.metrics import DepthAlignment
+from vipe_core.evaluation.metrics import DepthAlignment, sample_mask
 from vipe_core.evaluation.results import Paths, SequenceResult, flat_figures, load_result, save_result
-from vipe_core.evaluation.truth import Estimate, SequenceReport, evaluate, evaluate_artifacts
+from vipe_core.evaluation.truth import Estimate, GroundTruth, SequenceReport, evaluate, evaluate_artifacts
 from vipe_core.formats import list_sequences, read_artifacts
 from vipe_core.pipeline.annotator import Annotator
 from vipe_core.pipeline.presets import Preset
@@ -258,14 +258,30 @@ def _against_truth(
     annotation: Annotation, sequence: GroundTruthSequence, task: Task
 ) -> tuple[SequenceReport, Paths | None]:
     frames = np.arange(annotation.num_frames)
-    depth = None
-    if task.measure.depth and sequence.truth.depth is not None:
-        depth = (frame.depth for frame in annotation.dense())
+    truth = sequence.truth
+    depth: Iterator[NDArray[np.float32]] | None = None
+    masks: list[NDArray[np.uint8]] | None = None
+    if task.measure.depth and truth.depth is not None:
+        masks = None if truth.dynamic is None else []
+        depth = _depth_and_masks(annotation, truth, masks)
     estimate = Estimate(
-        annotation.name, annotation.world_from_cam, frames, annotation.camera, depth, annotation.depth_kind
+        annotation.name, annotation.world_from_cam, frames, annotation.camera, depth, annotation.depth_kind, masks
     )
-    report = evaluate(estimate, sequence.truth, task.measure.alignment, _max_depth(task))
+    report = evaluate(estimate, truth, task.measure.alignment, _max_depth(task))
     return report, _truth_paths(annotation.world_from_cam, frames, annotation.timestamps_s, sequence)
+
+
+def _depth_and_masks(
+    annotation: Annotation, truth: GroundTruth, masks: list[NDArray[np.uint8]] | None
+) -> Iterator[NDArray[np.float32]]:
+    """The depth of every frame; on the way the masks are put into `masks`, at the size of the truth where it has some.
+
+    The stream is expensive and gives both: the masks are complete when the depth has been gone through.
+    """
+    for frame in annotation.dense():
+        if masks is not None and truth.dynamic is not None:
+            masks.append(sample_mask(frame.mask, *truth.dynamic.shape[1:]).astype(np.uint8))
+        yield frame.depth
 
 
 def _score(task: Task) -> tuple[SequenceResult, Paths | None]:
