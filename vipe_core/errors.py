@@ -7,7 +7,8 @@
     │   ├── CorruptMedia          media_corrupt
     │   ├── NoVideoStream         no_video_stream
     │   ├── UnsupportedMedia      media_unsupported
-    │   └── MediaTooLarge         media_too_large
+    │   ├── MediaTooLarge         media_too_large
+    │   └── MaskMismatch          mask_mismatch       given masks do not belong to the pictures
     ├── DecodeError           the decoder child is the cause
     │   ├── DecodeTimeout         decode_timeout      (retryable)
     │   └── DecodeCrashed         decode_crashed      (retryable)
@@ -79,6 +80,12 @@ class MediaTooLarge(InputError):
     """More pixels or frames than the configured limits allow."""
 
     code = "media_too_large"
+
+
+class MaskMismatch(InputError):
+    """Masks were given that are not one per picture, or not of the pictures' size."""
+
+    code = "mask_mismatch"
 
 
 class DecodeError(VipeError):

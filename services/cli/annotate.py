@@ -18,11 +18,15 @@ if TYPE_CHECKING:
 def annotate(
     inputs: Annotated[list[Path], typer.Argument(metavar="INPUT...", help="Video files, or directories of images.")],
     output: Annotated[
-        Path, typer.Option("-o", "--output", metavar="OUT", help="Gets pose/, intrinsics/, depth/, rgb/.")
+        Path, typer.Option("-o", "--output", metavar="OUT", help="Gets pose/, intrinsics/, depth/, rgb/, mask/.")
     ],
     preset: Annotated[str, typer.Option(help="Which components do the work.")] = "classical",
     camera: Annotated[str, typer.Option(help="Camera model.")] = "pinhole",
     device: Annotated[str, typer.Option(help="cpu or cuda.")] = "cpu",
+    masks: Annotated[
+        Path | None,
+        typer.Option(metavar="DIR", help="One PNG per frame of the one INPUT; what is not zero in it is not used."),
+    ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="One JSON line per input on stdout, nothing else.")] = False,
 ) -> None:
     """Annotate videos on this machine, without the service.
@@ -35,6 +39,8 @@ def annotate(
     from vipe_core.formats import SequenceNames
     from vipe_core.pipeline.annotator import Annotator
 
+    if masks is not None and len(inputs) > 1:
+        raise typer.BadParameter(f"the masks are of one input, not of {len(inputs)}", param_hint="--masks")
     console = Console(stderr=True, quiet=as_json)
     annotator = Annotator(preset=preset, camera=camera, device=device)
     names = SequenceNames(output)
@@ -42,7 +48,7 @@ def annotate(
     for path in inputs:
         started = time.perf_counter()
         try:
-            row = _annotate_one(annotator, path, output, names.name_for(path), console)
+            row = _annotate_one(annotator, path, output, names.name_for(path), masks, console)
             row["seconds"] = round(time.perf_counter() - started, 3)
             row["frames_per_s"] = round(row["num_frames"] / row["seconds"], 3)
         except VipeError as error:
@@ -62,7 +68,9 @@ def annotate(
         raise typer.Exit(1)
 
 
-def _annotate_one(annotator: Annotator, path: Path, output: Path, name: str, console: Any) -> dict[str, Any]:
+def _annotate_one(
+    annotator: Annotator, path: Path, output: Path, name: str, masks: Path | None, console: Any
+) -> dict[str, Any]:
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
     from vipe_core.annotation import Progress as EngineProgress
@@ -81,7 +89,7 @@ def _annotate_one(annotator: Annotator, path: Path, output: Path, name: str, con
         def report(progress: EngineProgress) -> None:
             bars.update(task, description=progress.stage, completed=progress.frames_done, total=progress.frames_total)
 
-        annotation = annotator.annotate(path, name=name, progress=report)
+        annotation = annotator.annotate(path, name=name, masks=masks, progress=report)
 
         def written(done: int, total: int) -> None:
             bars.update(task, description="depth", completed=done, total=total)

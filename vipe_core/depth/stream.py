@@ -131,7 +131,7 @@ class DenseDepth:
         value = np.clip(value, 0.2 * prior.low, 4 * prior.high).astype(np.float32)
         full_gray = cv2.cvtColor(picture.rgb, cv2.COLOR_RGB2GRAY)
         depth, sure = upsample(value, confidence, gray, full_gray, _EDGE, _SAME)
-        return DepthFrame(index, picture.rgb, depth, np.clip(sure, 0, 1))
+        return DepthFrame(index, picture.rgb, depth, np.clip(sure, 0, 1), picture.masked)
 
 
 def _half_gray(frame: Frame) -> NDArray[np.uint8]:

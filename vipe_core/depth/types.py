@@ -99,9 +99,11 @@ class DepthFrame:
         depth: (H, W) float32, finite and positive on every pixel, in units of the trajectory: z for pinhole, distance
             for the other models.
         confidence: (H, W) float32 in 0..1; 0 is a value that was filled in.
+        masked: (H, W) bool, what the frame itself says must not be used, or None.
     """
 
     index: int
     rgb: NDArray[np.uint8]
     depth: NDArray[np.float32]
     confidence: NDArray[np.float32]
+    masked: NDArray[np.bool_] | None = None

@@ -22,7 +22,7 @@ from vipe_core.priors.classical import classical_priors
 from vipe_core.quality import assess
 from vipe_core.slam.segmentation import segment
 from vipe_core.slam.system import Slam, SlamResult
-from vipe_core.video import open_source
+from vipe_core.video import MaskedView, open_source
 from vipe_core.video.source import FrameSource
 
 logger = logging.getLogger(__name__)
@@ -56,20 +56,30 @@ class Annotator:
         set_threads(threads)
 
     def annotate(
-        self, video: str | Path | FrameSource, *, name: str | None = None, progress: ProgressCallback | None = None
+        self,
+        video: str | Path | FrameSource,
+        *,
+        name: str | None = None,
+        masks: str | Path | None = None,
+        progress: ProgressCallback | None = None,
     ) -> Annotation:
         """Poses, camera and quality of a video file or a directory of images; dense depth when it is asked for.
 
         Args:
             video: A video file, a directory of images in order of their names, or frames from elsewhere.
             name: Name of the sequence; the sanitised stem if None. Frames from elsewhere have theirs.
+            masks: Directory of PNGs, one per frame, named like the pictures or by the number of the frame from 0: what
+                is not zero in them is not used to find poses, camera and map, and is part of the masks that come out.
             progress: Told how far the annotation is; an exception out of it ends the annotation.
 
         Raises:
-            InputError, DecodeError: The input cannot be read. Its code and message are meant for the user.
+            InputError, DecodeError: The input cannot be read, or the masks are not of this video (MaskMismatch). Code
+                and message are meant for the user.
             EngineError: A stage failed, a defect of ours; what went wrong is its `__cause__`. So does the dense stream.
         """
         source = open_source(video, name=name) if isinstance(video, (str, Path)) else video
+        if masks is not None:
+            source = MaskedView(source, masks)
         report = _Reporter(progress)
 
         # New matchers for each video: OpenCV's flow object keeps buffers of the last picture size and is not safe to
@@ -120,6 +130,7 @@ class Annotator:
                 "pixel_format": info.pixel_format,
                 "size_bytes": info.size_bytes,
                 "rotation_deg": info.rotation_deg,
+                **({"num_masks": source.num_masks} if isinstance(source, MaskedView) else {}),
             },
         )
 
@@ -138,6 +149,8 @@ class Annotator:
                     frame = next(frames, None)
                     if frame is not None:
                         mask = segment(frame.rgb, result.trajectory.labels[frame.index], result.grid)
+                        if frame.masked is not None:
+                            mask[frame.masked] = 1
                 spent_s += time.perf_counter() - start_s
                 timings["depth"] = spent_s
                 if frame is None:
@@ -199,6 +212,7 @@ def annotate(
     preset: str | Preset = "classical",
     camera: str = "pinhole",
     device: str = "cpu",
+    masks: str | Path | None = None,
     progress: ProgressCallback | None = None,
 ) -> Annotation:
     """Annotate one video; see `Annotator`, which is the better choice for several.
@@ -207,4 +221,4 @@ def annotate(
         annotation = vipe_core.annotate("clip.mp4")
         annotation.world_from_cam, annotation.camera.fov_x_deg, annotation.quality.reliable
     """
-    return Annotator(preset, camera, device).annotate(video, progress=progress)
+    return Annotator(preset, camera, device).annotate(video, masks=masks, progress=progress)

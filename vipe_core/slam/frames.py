@@ -11,8 +11,8 @@ from vipe_core.priors.protocols import DenseMatcher, WorkingFrame
 from vipe_core.slam.working import WorkingSize, working_frame
 from vipe_core.video.source import FrameSource
 
-# A gray picture with what is computed from it, bytes per pixel.
-_BYTES_PER_PX = 1.5
+# A gray picture with what is computed from it, and which pixels of it are usable, bytes per pixel.
+_BYTES_PER_PX = 2.5
 
 
 class EncodedFrames:

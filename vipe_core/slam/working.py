@@ -58,16 +58,19 @@ def working_frame(frame: Frame) -> WorkingFrame:
     """The working frame of a picture that was decoded at the working size.
 
     Black rows and columns along the border (letterboxes) are not valid. The edge of such a bar stands still whatever
-    the camera does, and draws the flow beside it along, so the picture is continued into it.
+    the camera does, and draws the flow beside it along, so the picture is continued into it. Nor is what the frame
+    itself says must not be used.
     """
     gray = np.asarray(cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY), dtype=np.uint8)
     rows, columns = (np.flatnonzero(gray.max(axis=axis) > _BAR_LEVEL) for axis in (1, 0))
     height, width = gray.shape
     if not len(rows) or (rows[0] == columns[0] == 0 and rows[-1] == height - 1 and columns[-1] == width - 1):
-        return WorkingFrame(frame.index, gray, frame.rgb)
+        return WorkingFrame(frame.index, gray, frame.rgb, None if frame.masked is None else ~frame.masked)
     top, bottom, left, right = int(rows[0]), int(rows[-1]) + 1, int(columns[0]), int(columns[-1]) + 1
     valid = np.zeros(gray.shape, dtype=np.bool_)
     valid[top:bottom, left:right] = True
+    if frame.masked is not None:
+        valid &= ~frame.masked
     inside = gray[top:bottom, left:right]
     gray = np.asarray(
         cv2.copyMakeBorder(inside, top, height - bottom, left, width - right, cv2.BORDER_REPLICATE), dtype=np.uint8

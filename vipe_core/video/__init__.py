@@ -5,6 +5,7 @@ Kept free of heavy imports (torch, OpenCV, PyAV): the decoder child imports this
 
 from vipe_core.video.image_directory import ImageDirectorySource
 from vipe_core.video.limits import Limits
+from vipe_core.video.masks import MaskedView
 from vipe_core.video.naming import sanitise_name
 from vipe_core.video.opening import open_source
 from vipe_core.video.probe import probe
@@ -17,6 +18,7 @@ __all__ = [
     "FrameStream",
     "ImageDirectorySource",
     "Limits",
+    "MaskedView",
     "VideoFileSource",
     "VideoInfo",
     "open_source",

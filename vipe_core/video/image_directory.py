@@ -80,6 +80,7 @@ class ImageDirectorySource:
             codec=first.suffix.lower().lstrip("."),
             pixel_format="rgb24",
             size_bytes=size_bytes,
+            frame_names=tuple(file.stem for file in self._files),
         )
 
     @property

@@ -18,6 +18,7 @@ class VideoInfo:
         num_frames_hint: Frame count as the container states it, or None; decoding has the last word.
         fps: Average frame rate (30 for a directory of images).
         rotation_deg: Clockwise rotation that was applied to make the picture upright: 0, 90, 180 or 270.
+        frame_names: Names of the files that the pictures are from, without suffix; empty for a video.
     """
 
     name: str
@@ -31,6 +32,7 @@ class VideoInfo:
     codec: str
     pixel_format: str
     size_bytes: int
+    frame_names: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,11 +43,14 @@ class Frame:
         index: 0, 1, 2 ... in presentation order.
         timestamp_s: Presentation time from the container, strictly increasing; index / fps for images.
         rgb: (height, width, 3) uint8, upright.
+        masked: (height, width) bool, True on pixels that must not be used because the user says so; None where nothing
+            is said.
     """
 
     index: int
     timestamp_s: float
     rgb: NDArray[np.uint8]
+    masked: NDArray[np.bool_] | None = None
 
 
 # A generator, so that `close` (or `contextlib.closing`) is there to end the decoder early.

@@ -54,6 +54,8 @@ class Distortion:
 class FrameView:
     """A part of a frame source, with its pictures undistorted, then cropped.
 
+    Masks belong to the pictures that are seen: `MaskedView` goes around this one.
+
     Args:
         source: What is looked at.
         stop: Frames from this one on are left out; all are seen if None.
@@ -132,7 +134,10 @@ class ReversedView:
     def __init__(self, source: FrameSource, timestamps_s: Sequence[float] | Array) -> None:
         self._source = source
         self._times_s = np.asarray(timestamps_s, dtype=np.float64)
-        self._info = dataclasses.replace(source.info, num_frames_hint=len(self._times_s))
+        info = source.info
+        self._info = dataclasses.replace(
+            info, num_frames_hint=len(self._times_s), frame_names=tuple(reversed(info.frame_names))
+        )
 
     @property
     def info(self) -> VideoInfo:
@@ -151,7 +156,7 @@ class ReversedView:
                 held = list(frames)
             for frame in reversed(held):
                 time_s = float(self._times_s[-1] - self._times_s[frame.index])
-                yield Frame(count - 1 - frame.index, time_s, frame.rgb)
+                yield Frame(count - 1 - frame.index, time_s, frame.rgb, frame.masked)
             end = begin
 
 
@@ -165,7 +170,15 @@ def _shortened(info: VideoInfo, stop: int | None, timestamps_s: Sequence[float] 
         fps = (len(timestamps_s) - 1) / span_s if span_s > 0 else fps
         duration_s = span_s + 1 / fps
     width, height = (info.width, info.height) if crop is None else (crop.width, crop.height)
-    return dataclasses.replace(info, width=width, height=height, num_frames_hint=count, fps=fps, duration_s=duration_s)
+    return dataclasses.replace(
+        info,
+        width=width,
+        height=height,
+        num_frames_hint=count,
+        fps=fps,
+        duration_s=duration_s,
+        frame_names=info.frame_names[:stop],
+    )
 
 
 def _undistortion(lens: Distortion, width: int, height: int) -> tuple[Array, Array]:
