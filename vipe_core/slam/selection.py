@@ -95,7 +95,12 @@ class _Thinned:
 
 
 class _MotionFilter:
-    """Makes a frame a keyframe when the picture has moved by `threshold_px` since the last one."""
+    """Makes a frame a keyframe when the picture has moved by `threshold_px` since the last one.
+
+    Attributes:
+        max_motion_px: Largest displacement of a frame against the keyframe before it.
+        path_px: All that the displacement went up and down.
+    """
 
     def __init__(self, matcher: DenseMatcher, threshold_px: float) -> None:
         self.matcher = matcher
@@ -103,7 +108,7 @@ class _MotionFilter:
         self.num_frames = 0
         self.keyframes: list[Keyframe] = []
         self.max_motion_px = 0.0
-        self.total_motion_px = 0.0
+        self.path_px = 0.0
         self._previous: Keyframe | None = None
         self._previous_motion_px = 0.0
 
@@ -115,33 +120,35 @@ class _MotionFilter:
         motion_px = self._motion_px(current)
         if motion_px > 2 * self.threshold_px and self._previous is not None:
             # A jump: the frame before it is a nearer stepping stone than the last keyframe.
-            self._take(self._previous, self._previous_motion_px)
+            self._take(self._previous)
             motion_px = self._motion_px(current)
         self.max_motion_px = max(self.max_motion_px, motion_px)
+        self.path_px += abs(motion_px - self._previous_motion_px)
         if motion_px > self.threshold_px:
-            self._take(current, motion_px)
+            self._take(current)
         else:
             self._previous, self._previous_motion_px = current, motion_px
 
     def finish(self) -> None:
         """Consider the last frame: a keyframe when it adds a visible part of a step, so that nothing hangs over."""
-        if self._previous is not None:
-            if self._previous_motion_px > 0.25 * self.threshold_px:
-                self._take(self._previous, self._previous_motion_px)
-            else:
-                self.total_motion_px += self._previous_motion_px
+        if self._previous is not None and self._previous_motion_px > 0.25 * self.threshold_px:
+            self._take(self._previous)
 
     def lowered(self, min_keyframes: int, static_px: float) -> _MotionFilter | None:
-        """A filter with a lower threshold for the same shot; None when this one has found enough or nothing moves."""
+        """A filter with a lower threshold for the same shot; None when this one has found enough or nothing moves.
+
+        The path counts all motion, towards the last keyframe too: what returns would look slow by its net motion, and
+        get a keyframe at every frame.
+        """
         if len(self.keyframes) >= min(min_keyframes, self.num_frames) or self.max_motion_px < static_px:
             return None
-        lower_px = max(0.5 * static_px, min(0.6 * self.threshold_px, self.total_motion_px / (min_keyframes + 2)))
+        largest_px = min(self.threshold_px, self.max_motion_px)
+        lower_px = max(0.5 * static_px, min(0.6 * largest_px, self.path_px / (min_keyframes + 2)))
         logger.debug("%d keyframes are few: threshold lowered to %.2f px", len(self.keyframes), lower_px)
         return _MotionFilter(self.matcher, lower_px)
 
-    def _take(self, keyframe: Keyframe, motion_px: float) -> None:
+    def _take(self, keyframe: Keyframe) -> None:
         self.keyframes.append(keyframe)
-        self.total_motion_px += motion_px
         self._previous, self._previous_motion_px = None, 0.0
 
     def _motion_px(self, current: Keyframe) -> float:
