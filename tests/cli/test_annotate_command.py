@@ -46,6 +46,26 @@ def test_videos_and_images_become_artifacts(vipectl: Run, clip: Path, tmp_path: 
     assert sources == {"broken": str(broken), "sideways": str(clip), "sideways-2": str(images)}
 
 
+def test_masks_of_ones_own(vipectl: Run, clip: Path, tmp_path: Path) -> None:
+    masks = tmp_path / "masks"
+    masks.mkdir()
+    for frame in open_source(clip).frames():
+        mask = np.zeros(frame.rgb.shape[:2], np.uint8)
+        mask[20:60, 30:90] = 1
+        cv2.imwrite(str(masks / f"{frame.index}.png"), mask)
+
+    done = vipectl("annotate", clip, "-o", "out", "--masks", masks, "--json")
+
+    assert done.returncode == 0
+    with read_artifacts(tmp_path / "out", json.loads(done.stdout)["name"]).open_mask() as found:
+        assert all((mask[20:60, 30:90] == 1).all() for mask in found)
+    assert vipectl("annotate", clip, clip, "-o", "out", "--masks", masks).returncode == 2
+    (masks / "0.png").unlink()
+    done = vipectl("annotate", clip, "-o", "out", "--masks", masks, "--json")
+    assert done.returncode == 1
+    assert json.loads(done.stdout)["error"]["code"] == "mask_mismatch"
+
+
 def test_the_table_for_people(vipectl: Run, clip: Path, tmp_path: Path) -> None:
     shutil.copyfile(clip, tmp_path / "my clip.mp4")
     done = vipectl("annotate", "my clip.mp4", "-o", "out")

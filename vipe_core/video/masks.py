@@ -74,7 +74,7 @@ class MaskedView:
                 mask = next(masks, None)
                 if mask is None:
                     raise self._wrong_count(f"frame {frame.index} has none")
-                masked = _reduced(mask.rgb.any(axis=2), frame.rgb.shape[1], frame.rgb.shape[0])
+                masked = _reduced(np.asarray(mask.rgb.max(axis=2) > 0), frame.rgb.shape[1], frame.rgb.shape[0])
                 yield dataclasses.replace(frame, masked=masked)
                 end = frame.index + 1
             if (stop is None or end < stop) and end < self._count:
