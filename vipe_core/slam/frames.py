@@ -11,8 +11,9 @@ from vipe_core.priors.protocols import DenseMatcher, WorkingFrame
 from vipe_core.slam.working import WorkingSize, working_frame
 from vipe_core.video.source import FrameSource
 
-# A gray picture with what is computed from it, and which pixels of it are usable, bytes per pixel.
-_BYTES_PER_PX = 2.5
+# A gray picture with what is computed from it, and which pixels of it are usable where not all are; bytes per pixel.
+_BYTES_PER_PX = 1.5
+_MASK_BYTES_PER_PX = 2.0
 
 
 class EncodedFrames:
@@ -32,7 +33,7 @@ class EncodedFrames:
         self._size = size
         self.matcher = matcher
         self.total_hint = source.info.num_frames_hint
-        self._capacity = int(cache_bytes / (_BYTES_PER_PX * size.width * size.height))
+        self._free_px_bytes = cache_bytes / (size.width * size.height)
         self._kept: list[Any] = []
         self.times_s: list[float] = []
 
@@ -57,7 +58,8 @@ class EncodedFrames:
                 features = self.matcher.encode(work)
                 if self.cached:
                     self._kept.append(features)
-                if len(self._kept) > self._capacity:
+                self._free_px_bytes -= _BYTES_PER_PX + (0 if work.valid is None else _MASK_BYTES_PER_PX)
+                if self._free_px_bytes < 0:
                     self._kept = []
                 self.times_s.append(frame.timestamp_s)
                 yield work, features
