@@ -149,6 +149,13 @@ def test_frames_without_features_resemble_nothing() -> None:
     assert not similarity([blank, blank]).any()
 
 
+@pytest.mark.filterwarnings("error")
+def test_frames_that_all_look_the_same_are_no_trouble() -> None:
+    descriptors = np.tile(np.eye(8, dtype=np.float32), (4, 1))
+    alike = similarity([descriptors, descriptors, descriptors])
+    assert np.isfinite(alike).all()
+
+
 def nodes_on_a_circle(count: int) -> list[Sim3]:
     angles = 2 * np.pi * np.arange(count) / count
     turn = Rotation.from_rotvec(np.stack([0 * angles, angles, 0 * angles], axis=1)).as_matrix()

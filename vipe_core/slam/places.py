@@ -5,6 +5,7 @@ The vocabulary is made from the video itself, so nothing has to be trained or sh
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 
 import numpy as np
@@ -23,7 +24,10 @@ def similarity(descriptors: Sequence[NDArray[np.float32]]) -> NDArray[np.float32
     if len(everything) < _WORDS:
         return np.zeros((count, count), np.float32)
     chosen = np.linspace(0, len(everything) - 1, min(len(everything), _TRAINING)).astype(np.int64)
-    words, _ = kmeans2(everything[chosen].astype(np.float64), _WORDS, iter=8, minit="points", rng=_SEED)
+    with warnings.catch_warnings():
+        # A word that no descriptor is nearest to, where many are the same: it stays what it was, and counts nothing.
+        warnings.filterwarnings("ignore", "One of the clusters is empty")
+        words, _ = kmeans2(everything[chosen].astype(np.float64), _WORDS, iter=8, minit="points", rng=_SEED)
     words = words.astype(np.float32)
     looks = np.stack([_vlad(found, words) for found in descriptors])
     # What all frames of the video have in common tells no places apart.
