@@ -27,7 +27,8 @@ _STRETCH = 32
 # Step of the probes and prior of the offset, shares of the image width.
 _PROBE_RATIO = 0.01
 _SIGMA_RATIO = 0.015
-_MAX_RATIO = 0.04
+# Lenses sit straighter than this. A fit that wants more pays for something else with it, such as lens distortion.
+_MAX_RATIO = 0.025
 # Least share of the cost that a move must save.
 _MIN_GAIN = 0.005
 
@@ -70,7 +71,10 @@ def refine_principal_point(keyframes: KeyframeMap, graph: Graph, adjuster: Adjus
         curvature = (above + below - 2 * centre) / step**2
         if curvature > 0:
             offset[axis] = -(above - below) / (2 * step) / (curvature + prior)
-    offset = np.clip(offset, -_MAX_RATIO * width, _MAX_RATIO * width)
+    size = keyframes.grid.stride * np.array([keyframes.grid.width, keyframes.grid.height])
+    if np.abs(start[2:4] + offset - (size - 1) / 2).max() > _MAX_RATIO * width:
+        logger.debug("principal point: (%.1f, %.1f) px from where it was is further than any lens", *offset)
+        return False
     gain = 1 - cost(offset) / centre if centre > 0 else 0.0
     logger.debug("principal point: (%.1f, %.1f) px off the centre would save %.4f of the cost", *offset, gain)
     if not gain > _MIN_GAIN:
