@@ -42,6 +42,16 @@ def test_what_geometry_leaves_open_goes_with_what_looks_like_it() -> None:
     np.testing.assert_array_equal(mask, segment(rgb, labels.reshape(-1), GRID))
 
 
+def test_a_few_scattered_labels_decide_about_the_hole_that_they_are_in() -> None:
+    """What a thing that changes its shape leaves: hardly a measurement on it, static ones around it."""
+    rgb, thing = picture()
+    labels = np.where(thing[8::16, 8::16], UNKNOWN, STATIC)
+    labels[7:20:3, 11:18:3] = MOVING
+    mask = segment(rgb, labels.reshape(-1), GRID)
+    overlap = (mask > 0) & thing
+    assert overlap.sum() / ((mask > 0) | thing).sum() > 0.9
+
+
 def test_specks_and_a_static_picture_make_no_mask() -> None:
     rgb, thing = picture()
     labels = np.full(GRID.num_cells, STATIC)

@@ -26,7 +26,7 @@ _DETAIL = 2
 _ITERATIONS = 2
 # Fewer cells than this are no thing but errors of matching.
 _MIN_CELLS = 6
-# Undecided cells are taken for moving at first where labels within so many cells say so.
+# Undecided cells are taken for moving at first where most labels within so many cells say so, or the nearest one does.
 _REACH_CELLS = 2.0
 
 
@@ -52,10 +52,10 @@ def segment(rgb: NDArray[np.uint8], labels: Array, grid: Grid) -> NDArray[np.uin
     nothing = np.zeros((height, width), dtype=np.uint8)
     cells = np.asarray(labels).reshape(grid.height, grid.width)
     moving = cv2.medianBlur((cells == MOVING).astype(np.uint8), 3)
-    if int(moving.sum()) < _MIN_CELLS or not (cells == STATIC).any():
+    leaning = _leaning(cells, moving)
+    if int(leaning.sum()) < _MIN_CELLS:
         return nothing
-    leaning = cv2.GaussianBlur(moving - np.where(cells == STATIC, np.float32(1), 0), (0, 0), _REACH_CELLS)
-    trimap = np.where(leaning > 0, cv2.GC_PR_FGD, cv2.GC_PR_BGD).astype(np.uint8)
+    trimap = np.where(leaning, cv2.GC_PR_FGD, cv2.GC_PR_BGD).astype(np.uint8)
     trimap[(cells == STATIC) & (moving == 0)] = cv2.GC_BGD
     trimap[cv2.erode(moving, np.ones((3, 3), np.uint8)) > 0] = cv2.GC_FGD
     foreground = (trimap == cv2.GC_FGD) | (trimap == cv2.GC_PR_FGD)
@@ -75,3 +75,21 @@ def segment(rgb: NDArray[np.uint8], labels: Array, grid: Grid) -> NDArray[np.uin
     kept = large[parts].astype(np.float32)
     enlarged = cv2.resize(kept, (width, height), interpolation=cv2.INTER_LINEAR)
     return np.asarray(enlarged > 0.5, dtype=np.uint8)
+
+
+def _leaning(cells: Array, moving: Array) -> NDArray[np.bool_]:
+    """(h, w) bool, cells that may belong to something that moves: by most labels around them, or by the nearest one.
+
+    A thing that changes its shape leaves few measurements, scattered inside of a hole in the static scene: the nearest
+    label knows the hole. Cells that stand alone with it are errors of matching, and the fringes of static things.
+    """
+    static = cells == STATIC
+    if not static.any() or not (cells == MOVING).any():
+        return np.zeros(cells.shape, dtype=np.bool_)
+    around = cv2.GaussianBlur(moving - np.where(static, np.float32(1), 0), (0, 0), _REACH_CELLS) > 0
+    to_moving, to_static = (
+        cv2.distanceTransform((cells != label).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+        for label in (MOVING, STATIC)
+    )
+    nearest = cv2.morphologyEx((to_moving < to_static).astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
+    return np.asarray(around | (nearest > 0), dtype=np.bool_)
