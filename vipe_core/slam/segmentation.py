@@ -52,12 +52,13 @@ def segment(rgb: NDArray[np.uint8], labels: Array, grid: Grid) -> NDArray[np.uin
     nothing = np.zeros((height, width), dtype=np.uint8)
     cells = np.asarray(labels).reshape(grid.height, grid.width)
     moving = cv2.medianBlur((cells == MOVING).astype(np.uint8), 3)
-    leaning = _leaning(cells, moving)
-    if int(leaning.sum()) < _MIN_CELLS:
-        return nothing
-    trimap = np.where(leaning, cv2.GC_PR_FGD, cv2.GC_PR_BGD).astype(np.uint8)
+    trimap = np.where(_leaning(cells, moving), cv2.GC_PR_FGD, cv2.GC_PR_BGD).astype(np.uint8)
     trimap[(cells == STATIC) & (moving == 0)] = cv2.GC_BGD
     trimap[cv2.erode(moving, np.ones((3, 3), np.uint8)) > 0] = cv2.GC_FGD
+    # Either side needs something to take its colours from.
+    front = (trimap == cv2.GC_FGD) | (trimap == cv2.GC_PR_FGD)
+    if int(front.sum()) < _MIN_CELLS or front.all():
+        return nothing
     foreground = (trimap == cv2.GC_FGD) | (trimap == cv2.GC_PR_FGD)
     if not foreground.any() or foreground.all():
         # A strip too thin to hold its ground among static cells, or nothing left to hold anything against.
