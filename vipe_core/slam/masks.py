@@ -133,7 +133,7 @@ class MotionMasks:
         measured = [j for j in targets if (k, j) in self._graph]
         if not measured:
             return None
-        relative = np.stack([relative_pose(keyframes.pose(j), keyframes.pose(k)) for j in measured])
+        relative = relative_pose(np.stack([keyframes.pose(j) for j in measured]), keyframes.pose(k))
         matches = [self._graph[k, j] for j in measured]
         return agree(
             self._reprojector, keyframes.intrinsics, relative, matches, self.robust_scale_px, keyframes.depth(k)

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vipe_core.ba.problem import Grid
-from vipe_core.compilation import compiled
+from vipe_core.compilation import vectorised
 from vipe_core.priors.classical.features import STRIDE, Array, FlowFeatures, sample_px
 from vipe_core.priors.protocols import Match
 
@@ -155,7 +155,7 @@ def _certainty(information: NDArray[np.float32], residual: NDArray[np.float32]) 
     return np.asarray(certainty * explained[:, None])
 
 
-@compiled
+@vectorised
 def _align(
     source: Array,
     target: Array,
