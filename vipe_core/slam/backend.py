@@ -30,8 +30,6 @@ _FOV_RANGE_DEG = (12.0, 150.0)
 _OBSERVED_RATIO = 0.7
 # Share of a keyframe's cells whose change of mask calls for another adjustment.
 _VISIBLE_CHANGE = 0.02
-# The second sharpening starts from depths that know the distortion of the patches better.
-_SHARPENINGS = 2
 _SUBSAMPLE = 4
 # The principal point couples with rotation and position, so that one round of probes only comes near.
 _MAX_CENTRINGS = 3
@@ -88,16 +86,17 @@ class Backend:
         return result
 
     def sharpen(self) -> Result | None:
-        """Measure every edge again from the adjusted geometry, and keyframes farther apart; adjust; twice.
+        """Measure every edge again from the adjusted geometry and adjust; then once more, and keyframes farther apart.
 
+        The second time starts from depths that know the distortion of the patches better, which wide edges need most.
         Steps between neighbours add up like a random walk. Edges over several keyframes hold the sum.
         The motion masks stay: alignments start from where the cells would be if nothing moved.
         """
         if len(self._keyframes) < 2 or not self._measured.can_sharpen:
             return None
         result: Result | None = None
-        for _ in range(_SHARPENINGS):
-            edges = sorted({*self._measured.graph, *self._wide_edges()})
+        for wide in (False, True):
+            edges = sorted({*self._measured.graph, *(self._wide_edges() if wide else ())})
             for i, j in edges:
                 self._measured.sharpen(i, j, self._settings.min_consistent)
             result = self._adjust(SETTLE)
