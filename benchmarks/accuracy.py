@@ -7,8 +7,9 @@ every sequence that something is asked of. Ours is made anew (poses and intrinsi
 ROOT (ViPE's layout, under the sequence's name or that of its pictures), with depth then. The trivial answer is a camera
 that never moves, a field of view of 60 degrees and the same depth everywhere; for artifacts the `x` columns say how
 many times smaller our errors are. With --peers, COLMAP gets the same frames of the sequences that are measured against
-it, and its better mapper is shown; --cache keeps its results. Depth errors are of static pixels after one median scale;
-the IoU of the masks is of all moving pixels, where the truth has any.
+it, and its better mapper is shown; --cache keeps its results. Our field of view comes with its 95 % interval, marked
+with a `!` where the truth is outside. Depth errors are of static pixels after one median scale; the IoU of the masks is
+of all moving pixels, where the truth has any.
 The status is 1 when something that is asked is not met.
 """
 
@@ -57,6 +58,7 @@ class Ours:
         frame_index: (N,) frames of the video.
         verdict: `yes`, `doubtful` or `no`; empty where the artifacts do not say.
         reasons: Of the verdict.
+        fov_interval_deg: In which the field of view lies with 95 %; None where the artifacts do not say.
         median_depth: Of one frame, in units of the path, to judge what a camera that stands still does; None unless it
             is needed.
         cpu_s_per_frame: None for artifacts.
@@ -68,6 +70,7 @@ class Ours:
     report: SequenceReport
     verdict: str
     reasons: tuple[str, ...]
+    fov_interval_deg: tuple[float, float] | None
     median_depth: float | None
     cpu_s_per_frame: float | None
 
@@ -148,6 +151,7 @@ def _annotated(sequence: BenchSequence, truth: GroundTruth) -> Ours:
         evaluate(estimate, truth),
         quality.reliable,
         quality.reasons,
+        quality.fov_interval_deg,
         depth,
         measured.cpu_s_per_frame,
     )
@@ -170,9 +174,16 @@ def _stored(root: Path, sequence: BenchSequence, truth: GroundTruth) -> Ours:
         evaluate_artifacts(artifacts, truth),
         str(quality.get("reliable", "")),
         tuple(quality.get("reasons", ())),
+        _interval(quality.get("fov_interval_deg")),
         depth,
         None,
     )
+
+
+def _interval(stored: Any) -> tuple[float, float] | None:
+    if not isinstance(stored, list) or len(stored) != 2 or None in stored:
+        return None
+    return float(stored[0]), float(stored[1])
 
 
 def _median_depth(depth: NDArray[np.float32]) -> float | None:
@@ -224,7 +235,7 @@ def _checks(limit: Limit, ours: Ours, peer: Peer | None) -> list[tuple[str, bool
 
 def _table(with_depth: bool) -> Table:
     table = Table(title="Accuracy against ground truth")
-    headings = ["sequence", "posed", "ATE %", "RTE %", "RRE deg", "rot deg", "FOV", "true", "off"]
+    headings = ["sequence", "posed", "ATE %", "RTE %", "RRE deg", "rot deg", "FOV", "true", "off", "95 %"]
     if with_depth:
         headings += ["AbsRel", "logRMSE", "d1.25", "depth/pose", "mask IoU", "x ATE", "x FOV", "x AbsRel"]
     headings += ["verdict", "CPU-s/frame", "asked: at most", "met"]
@@ -249,6 +260,7 @@ def _add_rows(
     report = ours.report
     frames = len(truth.world_from_cam)
     cells = [f"{round(report.coverage * frames)}/{frames}", *_pose_cells(report, ours.camera, true_fov)]
+    cells.append(_interval_cell(ours.fov_interval_deg, true_fov))
     if with_depth:
         cells += [
             *_depth_cells(report),
@@ -264,10 +276,10 @@ def _add_rows(
     if peer is not None:
         run = peer.run
         cells = [f"{len(run.frame_index)}/{run.num_frames}", *_pose_cells(peer.report, run.camera, true_fov)]
-        cells += [""] * depth_columns
+        cells += [""] * (1 + depth_columns)
         table.add_row(f"  COLMAP {run.mapper}", *cells, "", _number(run.cpu_s_per_posed_frame))
     static = _depth_cells(trivial) if with_depth else []
-    table.add_row("  trivial", "", *_pose_cells(trivial, None, None), *static, style="dim")
+    table.add_row("  trivial", "", *_pose_cells(trivial, None, None), "", *static, style="dim")
 
 
 def _pose_cells(report: SequenceReport, camera: Camera | None, true_fov: float | None) -> list[str]:
@@ -281,6 +293,13 @@ def _pose_cells(report: SequenceReport, camera: Camera | None, true_fov: float |
         "" if camera is None else _number(true_fov),
         _number(_fov_error(report)),
     ]
+
+
+def _interval_cell(interval: tuple[float, float] | None, true_fov: float | None) -> str:
+    if interval is None:
+        return ""
+    outside = true_fov is not None and not interval[0] <= true_fov <= interval[1]
+    return f"{interval[0]:.1f}-{interval[1]:.1f}{' !' if outside else ''}"
 
 
 def _depth_cells(report: SequenceReport) -> list[str]:
@@ -300,6 +319,7 @@ def _figures(name: str, ours: Ours, peer: Peer | None, checks: Sequence[tuple[st
         "sequence": name,
         "ours": asdict(ours.report),
         "fov_x_deg": ours.camera.fov_x_deg,
+        "fov_interval_deg": ours.fov_interval_deg,
         "verdict": ours.verdict,
         "reasons": list(ours.reasons),
         "drift_percent": ours.drift_percent,

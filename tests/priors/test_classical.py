@@ -7,7 +7,14 @@ import numpy as np
 import pytest
 from box_room import BoxRoom, look
 
-from vipe_core.priors.classical import DisFlowMatcher, LkTracker, PatchAligner, TwoViewFocalInit, classical_priors
+from vipe_core.priors.classical import (
+    CombinedFocalInit,
+    DisFlowMatcher,
+    LkTracker,
+    PatchAligner,
+    TwoViewFocal,
+    classical_priors,
+)
 from vipe_core.priors.classical.features import cell_centres_px, grid_of
 from vipe_core.priors.protocols import WorkingFrame
 
@@ -215,7 +222,7 @@ def orbit(room: BoxRoom, count: int) -> list[WorkingFrame]:
 @pytest.mark.parametrize("fov_deg", [45.0, 70.0])
 def test_focal_is_recovered_and_sure(fov_deg: float) -> None:
     frames = orbit(BoxRoom(fov_x_deg=fov_deg), 14)
-    estimate = TwoViewFocalInit().estimate(frames, grid_of(frames[0].gray))
+    estimate = CombinedFocalInit((TwoViewFocal(),)).estimate(frames, grid_of(frames[0].gray))
     assert estimate.camera.fov_x_deg == pytest.approx(fov_deg, abs=1.5)
     assert estimate.log_focal_sigma < 0.12
     assert estimate.num_pairs >= 3
@@ -223,8 +230,8 @@ def test_focal_is_recovered_and_sure(fov_deg: float) -> None:
 
 def test_two_frames_give_a_less_sure_focal(room: BoxRoom) -> None:
     frames = orbit(room, 14)
-    many = TwoViewFocalInit().estimate(frames, grid_of(frames[0].gray))
-    two = TwoViewFocalInit().estimate(frames[:8:7], grid_of(frames[0].gray))
+    many = CombinedFocalInit((TwoViewFocal(),)).estimate(frames, grid_of(frames[0].gray))
+    two = CombinedFocalInit((TwoViewFocal(),)).estimate(frames[:8:7], grid_of(frames[0].gray))
     assert two.num_pairs == 1
     assert two.log_focal_sigma > many.log_focal_sigma
 
@@ -232,7 +239,7 @@ def test_two_frames_give_a_less_sure_focal(room: BoxRoom) -> None:
 def test_static_camera_and_single_frame_take_the_default(room: BoxRoom) -> None:
     still = frame(room.render(look((0, 0, -3)))[0])
     for frames in ([still], [still] * 5):
-        estimate = TwoViewFocalInit().estimate(frames, grid_of(still.gray))
+        estimate = CombinedFocalInit((TwoViewFocal(),)).estimate(frames, grid_of(still.gray))
         assert estimate.num_pairs == 0
         assert estimate.log_focal_sigma == pytest.approx(0.3)
         assert estimate.camera.fov_x_deg == pytest.approx(60)
@@ -240,7 +247,7 @@ def test_static_camera_and_single_frame_take_the_default(room: BoxRoom) -> None:
 
 def test_pure_rotation_gives_a_focal_with_a_wider_sigma(room: BoxRoom) -> None:
     frames = [frame(room.render(look((0, 0, -3), yaw_deg=y))[0], k) for k, y in enumerate(np.linspace(-14, 14, 12))]
-    estimate = TwoViewFocalInit().estimate(frames, grid_of(frames[0].gray))
+    estimate = CombinedFocalInit((TwoViewFocal(),)).estimate(frames, grid_of(frames[0].gray))
     # Turning on the spot shows the focal length by itself, less surely than parallax does.
     assert estimate.camera.fov_x_deg == pytest.approx(60, abs=2)
     assert 0.05 < estimate.log_focal_sigma < 0.2
@@ -253,7 +260,7 @@ def test_a_plane_in_motion_is_no_rotation() -> None:
         cv2.warpAffine(wall, np.array([[1.0, 0, -9 * k], [0, 1, 2 * k]]), (640, 480))[40:440, :400] for k in range(12)
     ]
     frames = [frame(np.ascontiguousarray(v), k) for k, v in enumerate(views)]
-    estimate = TwoViewFocalInit().estimate(frames, grid_of(frames[0].gray))
+    estimate = CombinedFocalInit((TwoViewFocal(),)).estimate(frames, grid_of(frames[0].gray))
     assert estimate.log_focal_sigma > 0.25
     assert estimate.num_pairs == 0
 

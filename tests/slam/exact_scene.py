@@ -82,9 +82,9 @@ class ExactScene:
     def match_fast(self, source: int, target: int, guess_px: object = None) -> Match:
         return self.measure(source, target)
 
-    def priors(self, fov_deg: float = 60.0, sigma: float = 0.1) -> PriorFamily:
+    def priors(self, fov_deg: float = 60.0, sigma: float = 0.1, rivals_deg: Sequence[float] = ()) -> PriorFamily:
         """The scene as its own matcher, and an initial camera of the given field of view."""
-        return PriorFamily(matcher=self, tracker=None, points=None, intrinsics=_Guess(fov_deg, sigma))
+        return PriorFamily(matcher=self, tracker=None, points=None, intrinsics=_Guess(fov_deg, sigma, rivals_deg))
 
     # -- the frame source: pictures are blank, only their number counts --------------------------------------------
 
@@ -99,9 +99,10 @@ class ExactScene:
 
 
 class _Guess:
-    def __init__(self, fov_deg: float, sigma: float) -> None:
-        self._fov_deg, self._sigma = fov_deg, sigma
+    def __init__(self, fov_deg: float, sigma: float, rivals_deg: Sequence[float]) -> None:
+        self._fov_deg, self._sigma, self._rivals_deg = fov_deg, sigma, rivals_deg
 
     def estimate(self, frames: Sequence[WorkingFrame], grid: Grid) -> IntrinsicsEstimate:
         camera = Camera.pinhole_from_fov(self._fov_deg, grid.width * 8, grid.height * 8)
-        return IntrinsicsEstimate(camera, self._sigma, 1)
+        rivals = [Camera.pinhole_from_fov(fov, grid.width * 8, grid.height * 8) for fov in self._rivals_deg]
+        return IntrinsicsEstimate(camera, self._sigma, 1, tuple(rival.focal_px for rival in rivals))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import pytest
 import torch
@@ -13,9 +15,9 @@ from vipe_core.slam.settings import SlamSettings
 from vipe_core.slam.system import Slam, SlamResult
 
 
-def run(scene: ExactScene, fov_deg: float = 60.0, sigma: float = 0.1) -> SlamResult:
+def run(scene: ExactScene, fov_deg: float = 60.0, sigma: float = 0.1, rivals_deg: Sequence[float] = ()) -> SlamResult:
     settings = SlamSettings()
-    return Slam(scene.priors(fov_deg, sigma), settings, torch.device("cpu")).run(scene, lambda *_: None)
+    return Slam(scene.priors(fov_deg, sigma, rivals_deg), settings, torch.device("cpu")).run(scene, lambda *_: None)
 
 
 def position_error(result: SlamResult, scene: ExactScene) -> float:
@@ -37,6 +39,18 @@ def test_exact_measurements_give_the_exact_trajectory_and_focal_length() -> None
     assert result.camera.fov_x_deg == pytest.approx(60.0, abs=0.3)
     assert result.map.residual_px < 0.05
     assert result.map.inlier_ratio > 0.99
+
+
+def test_the_right_one_of_two_focal_lengths_is_found_when_the_likelier_is_wrong() -> None:
+    scene = ExactScene(trajectory(16, ARC))
+    result = run(scene, fov_deg=100.0, sigma=0.7, rivals_deg=(58.0,))
+    assert position_error(result, scene) < 2e-3
+    assert result.camera.fov_x_deg == pytest.approx(60.0, abs=0.5)
+
+
+def test_driving_straight_on_hardly_shows_the_focal_length_and_says_so() -> None:
+    result = run(ExactScene(trajectory(16, (0.0, 0.0, 0.06, 0.0, 0.0, 0.0))), sigma=0.3)
+    assert result.focal.sigma_ratio > 0.1
 
 
 @pytest.mark.parametrize("outliers", [0.08, pytest.param(0.33, marks=pytest.mark.slow)])

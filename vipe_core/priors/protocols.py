@@ -141,12 +141,14 @@ class IntrinsicsEstimate:
     Attributes:
         camera: At the working resolution.
         log_focal_sigma: Standard deviation of log(f): about 0.05 for a sure estimate, 0.3 for a default.
-        num_pairs: Number of frame pairs behind it; 0 means a default was taken.
+        num_pairs: Number of frames and pairs of frames behind it; 0 means a default was taken.
+        rivals_px: Focal lengths for which there is evidence that contradicts the camera's: to be tried too.
     """
 
     camera: Camera
     log_focal_sigma: float
     num_pairs: int
+    rivals_px: tuple[float, ...] = ()
 
 
 class IntrinsicsInit(Protocol):

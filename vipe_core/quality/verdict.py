@@ -8,7 +8,7 @@ Reason codes are stable: they are stored with every video.
     pure_rotation       no parallax: rotations are measured, positions and depth are not
     low_parallax        little parallax: positions and depth are weak
     low_texture         most of the picture could not be measured
-    focal_unobservable  the focal length is the initial guess, or no better than one
+    focal_unobservable  the field of view is not known to 10 %, or nothing but single pictures tells it
     high_residual       the measurements that fit, fit badly
     low_inliers         much of the picture contradicts the camera motion (moving objects, or a wrong solution)
     weak_link           two parts of a shot hang together by almost nothing: a blur, a jump
@@ -84,7 +84,9 @@ def assess(result: SlamResult, settings: SlamSettings, source_width: int) -> Qua
     if interpolated > _MAX_INTERPOLATED:
         reasons.append("interpolated_frames")
         fatal = fatal or interpolated > _MOSTLY_INTERPOLATED
-    if result.focal.sigma_ratio > settings.focal_doubt_sigma:
+    low_deg, high_deg = _fov_interval_deg(result)
+    # Lines may tell the focal length of a camera that never moves, but nothing then confirms it.
+    if result.motion == "static" or high_deg - low_deg > 2 * settings.fov_doubt_ratio * result.camera.fov_x_deg:
         reasons.append("focal_unobservable")
     reliable: Reliability = "no" if fatal else "doubtful" if reasons else "yes"
     to_source = source_width / result.working.width
@@ -96,7 +98,7 @@ def assess(result: SlamResult, settings: SlamSettings, source_width: int) -> Qua
         coverage=found.coverage,
         parallax_deg=found.parallax_deg,
         focal_sigma_ratio=result.focal.sigma_ratio,
-        fov_interval_deg=_fov_interval_deg(result),
+        fov_interval_deg=(low_deg, high_deg),
         frame_inlier_ratio=result.trajectory.inlier_ratio,
         frame_residual_px=(result.trajectory.residual_px * to_source).astype(np.float32),
         frame_coverage=result.trajectory.coverage,

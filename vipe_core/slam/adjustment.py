@@ -60,10 +60,15 @@ SETTLE = (Step("geman_mcclure", 1.0, 15),)
 
 @dataclass(frozen=True, slots=True)
 class FocalPrior:
-    """What the initialisation knows of the focal length: log(fx) at the working size and its standard deviation."""
+    """What the initialisation knows of the focal length: log(fx) at the working size and its standard deviation.
+
+    Attributes:
+        rivals: Other values of log(fx) for which there is evidence.
+    """
 
     log_focal: float
     sigma: float
+    rivals: tuple[float, ...] = ()
 
 
 class Adjuster:

@@ -42,6 +42,8 @@ _DEPTH_SPREAD = 20.0
 _HALF_WEIGHT = math.sqrt(math.sqrt(2) - 1)
 # A start that explains most of the picture needs no rival.
 _CONVINCING = 0.5
+# Where the focal length is hardly observable all starts cost the same, and the surest evidence decides.
+_CLEARLY_CHEAPER = 0.98
 # Masks that change by less than this share of a keyframe's cells have settled; they do in a few rounds.
 _STABLE = 0.02
 _MAX_ROUNDS = 3
@@ -109,8 +111,47 @@ class Bootstrap:
             for i in range(max(0, k - self._measured.reach(consistent, self._neighbours)), k - 1):
                 self._measured.connect(i, k, guided=False)
         if len(first) > 1:
-            self._start()
+            if self._adjuster.focal_prior.rivals:
+                self._start_from_each_focal()
+            else:
+                self._start()
             self._keyframes.normalise_scale()
+
+    def _start_from_each_focal(self) -> None:
+        """A start for every focal length that there is evidence for, adjusted with it free; the cheapest stays."""
+        keyframes = self._keyframes
+        everything = range(len(keyframes))
+        prior = self._adjuster.focal_prior
+        blank = keyframes.snapshot()
+        best: tuple[float, tuple[Array, Array, Array], NDArray[np.bool_]] | None = None
+        for log_focal in (prior.log_focal, *prior.rivals):
+            keyframes.restore(blank)
+            for k in everything:
+                keyframes.set_static(k, np.ones(keyframes.grid.num_cells, dtype=np.bool_))
+            scale = math.exp(log_focal - prior.log_focal)
+            keyframes.intrinsics = keyframes.intrinsics * np.array([scale, scale, 1.0, 1.0])
+            self._start()
+            self._adjuster.adjust(keyframes, self._graph, everything, (0,), REFINE, free_focal=True)
+            self._masks.update(everything)
+            cost = self._cost()
+            logger.debug("start at %.1f px: now %.1f, cost %.4f", math.exp(log_focal), keyframes.intrinsics[0], cost)
+            if best is None or cost < _CLEARLY_CHEAPER * best[0]:
+                best = cost, keyframes.snapshot(), keyframes.statics()
+        if best is not None:
+            keyframes.restore(best[1])
+            for k in everything:
+                keyframes.set_static(k, best[2][k])
+
+    def _cost(self) -> float:
+        """Mean robust cost of all measurements, 0..1, whatever the masks say: starts differ in their masks."""
+        good, measured = 0.0, 0
+        everything = range(len(self._keyframes))
+        for k in everything:
+            found = self._masks.agreement(k, everything)
+            if found is not None:
+                good += float((1 / (1 + np.square(found.error_px[found.measured] / self._grow_px))).sum())
+                measured += int(found.measured.sum())
+        return 1 - good / measured if measured else 1.0
 
     def _start(self) -> None:
         """The start that explains the largest area, adjusted; or the flat one where that explains more."""

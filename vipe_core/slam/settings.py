@@ -58,8 +58,10 @@ class SlamSettings:
         wide_steps: Keyframes apart of the edges that are added when the geometry is known.
         wide_overlap: Least share of cells seen by both ends of such an edge.
         focal_sigma_inflation: Factor on the solver's formal 1-sigma of log focal that makes it match real errors.
-        lens_sigma: 1-sigma of log focal from what a pinhole leaves out of a real lens: about one per cent.
-        focal_doubt_sigma: An inflated sigma above this makes the result doubtful.
+        lens_sigma: 1-sigma of log focal from what more measurements do not average away: what a pinhole leaves out of
+            a real lens, and matching errors that all frames share.
+        fov_doubt_ratio: Half the width of the 95 % interval of the field of view, as a share of it, from which on the
+            focal length counts as not observed.
         infill_batch: Frames posed in one motion-only adjustment.
         terms: Which terms of the energy are there.
     """
@@ -82,8 +84,8 @@ class SlamSettings:
     wide_steps: tuple[int, ...] = (3, 4)
     wide_overlap: float = 0.4
     focal_sigma_inflation: float = 6.0
-    lens_sigma: float = 0.01
-    focal_doubt_sigma: float = 0.05
+    lens_sigma: float = 0.015
+    fov_doubt_ratio: float = 0.1
     infill_batch: int = 16
     terms: EnergyTerms = field(default_factory=EnergyTerms)
 

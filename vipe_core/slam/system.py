@@ -137,7 +137,8 @@ class Slam:
     ) -> list[ShotMap]:
         """The maps of all shots, in order. The main one finds the focal length, the others take it over."""
         intrinsics = estimate.camera.index_params()
-        prior = FocalPrior(math.log(estimate.camera.focal_px), estimate.log_focal_sigma)
+        rivals = tuple(math.log(rival_px) for rival_px in estimate.rivals_px)
+        prior = FocalPrior(math.log(estimate.camera.focal_px), estimate.log_focal_sigma, rivals)
         maps: dict[int, ShotMap] = {}
         done = 0
         for number in [main, *(k for k in range(len(selection.shots)) if k != main)]:
@@ -171,7 +172,10 @@ class Slam:
         focal_px = estimate.camera.focal_px / math.sqrt(scale_x * scale_y)
         width, height = source.info.width, source.info.height
         square = Camera("pinhole", (focal_px, focal_px, width / 2, height / 2), width, height)
-        return IntrinsicsEstimate(square.resized(size.width, size.height), estimate.log_focal_sigma, estimate.num_pairs)
+        camera = square.resized(size.width, size.height)
+        scale = camera.focal_px / estimate.camera.focal_px
+        rivals_px = tuple(rival_px * scale for rival_px in estimate.rivals_px)
+        return IntrinsicsEstimate(camera, estimate.log_focal_sigma, estimate.num_pairs, rivals_px)
 
 
 def _joined(maps: Sequence[ShotMap], cam_from_world: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -2,28 +2,33 @@
 
 from __future__ import annotations
 
+from vipe_core.priors.classical.claims import CombinedFocalInit, FocalClaim
 from vipe_core.priors.classical.features import FlowFeatures
 from vipe_core.priors.classical.flow import DisFlowMatcher
-from vipe_core.priors.classical.focal import FocalVote, TwoViewFocalInit
+from vipe_core.priors.classical.focal import FocalVote, TwoViewFocal
 from vipe_core.priors.classical.patches import PatchAligner
 from vipe_core.priors.classical.sift import SiftMatcher
 from vipe_core.priors.classical.tracks import LkTracker
+from vipe_core.priors.classical.vanishing import VanishingFocal
 from vipe_core.priors.protocols import PriorFamily
 
 __all__ = [
+    "CombinedFocalInit",
     "DisFlowMatcher",
     "FlowFeatures",
+    "FocalClaim",
     "FocalVote",
     "LkTracker",
     "PatchAligner",
     "SiftMatcher",
-    "TwoViewFocalInit",
+    "TwoViewFocal",
+    "VanishingFocal",
     "classical_priors",
 ]
 
 
 def classical_priors() -> PriorFamily:
-    """DIS flow, Lucas-Kanade tracks and patches, SIFT correspondences and the two-view focal vote.
+    """DIS flow, Lucas-Kanade tracks and patches, SIFT correspondences, focal length from pairs and from lines.
 
     Make one per thread. The number of OpenCV threads is the caller's choice.
     """
@@ -32,6 +37,6 @@ def classical_priors() -> PriorFamily:
         matcher=matcher,
         tracker=LkTracker(),
         points=SiftMatcher(),
-        intrinsics=TwoViewFocalInit(matcher),
+        intrinsics=CombinedFocalInit((TwoViewFocal(matcher), VanishingFocal())),
         aligner=PatchAligner(),
     )

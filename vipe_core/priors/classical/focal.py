@@ -1,4 +1,4 @@
-"""Initial focal length from pairs of frames: shared-focal 6-point RANSAC and a robust vote.
+"""Focal length from pairs of frames: shared-focal 6-point RANSAC and a robust vote.
 
 Each pair gives a focal length (minimal solver of Kukelova et al., ECCV 2008, as found in PoseLib) and a weight that
 tells how much better an essential matrix explains it than a homography: without parallax the focal length of a pair
@@ -7,7 +7,6 @@ is not observable. The answer is the weighted median; its sigma comes from how w
 
 from __future__ import annotations
 
-import logging
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -16,13 +15,10 @@ import numpy as np
 import poselib
 from numpy.typing import NDArray
 
-from vipe_core.ba.problem import Grid
-from vipe_core.cameras import Camera
+from vipe_core.priors.classical.claims import FocalClaim
 from vipe_core.priors.classical.features import FlowFeatures, cell_centres_px
 from vipe_core.priors.classical.flow import DisFlowMatcher
-from vipe_core.priors.protocols import IntrinsicsEstimate, WorkingFrame
-
-logger = logging.getLogger(__name__)
+from vipe_core.priors.protocols import WorkingFrame
 
 # Where motion stops growing before it reaches the wanted amount, a pair is still taken from this share on.
 _ENOUGH_MOTION = 0.5
@@ -45,7 +41,7 @@ class FocalVote:
     """What one pair of frames says.
 
     Attributes:
-        source, target: Positions in the sequence that `estimate` was given.
+        source, target: Positions in the sequence that `votes` was given.
         focal_px: Focal length at the working resolution.
         weight: Inlier ratio x (1 - homography inlier ratio), less where little is matched, 0..1.
         motion_px: Median displacement between the frames.
@@ -60,19 +56,16 @@ class FocalVote:
     rotation_focal_px: float = math.nan
 
 
-class TwoViewFocalInit:
-    """`IntrinsicsInit` without a network.
+class TwoViewFocal:
+    """What pairs of frames say about the focal length.
 
-    Wants the frames in time order, up to about 200, evenly spread or consecutive: it picks anchors and their partners
-    itself and looks at no pair that the motion between them does not call for.
+    Picks anchors and their partners itself and looks at no pair that the motion between them does not call for.
 
     Args:
         matcher: Dense matcher.
         num_anchors: Frames that look for a partner.
         motion_ratio: Wanted median displacement to the partner, share of the image width.
         max_points: Upper bound of correspondences per pair.
-        default_fov_deg: Horizontal field of view where nothing can be said.
-        default_log_sigma: Standard deviation of log(f) of that default.
     """
 
     def __init__(
@@ -81,30 +74,15 @@ class TwoViewFocalInit:
         num_anchors: int = 10,
         motion_ratio: float = 30 / 640,
         max_points: int = 1500,
-        default_fov_deg: float = 60.0,
-        default_log_sigma: float = 0.3,
     ) -> None:
         self._matcher = matcher or DisFlowMatcher()
         self._num_anchors = num_anchors
         self._motion_ratio = motion_ratio
         self._max_points = max_points
-        self._default_fov_deg = default_fov_deg
-        self._default_log_sigma = default_log_sigma
 
-    def estimate(self, frames: Sequence[WorkingFrame], grid: Grid) -> IntrinsicsEstimate:
-        """A centred pinhole with square pixels; the default with a wide sigma when no pair shows parallax.
-
-        Args:
-            frames: In time order; at least one.
-            grid: Cells of the bundle adjustment (correspondences are taken at its sample points).
-        """
-        height, width = frames[0].gray.shape
-        votes = self.votes(frames)
-        default_focal = width / 2 / math.tan(math.radians(self._default_fov_deg) / 2)
-        focal, sigma, used = _combine(votes, default_focal, self._default_log_sigma)
-        logger.debug("focal %.1f px, sigma %.3f from %d pairs", focal, sigma, used)
-        camera = Camera("pinhole", (focal, focal, width / 2, height / 2), width, height)
-        return IntrinsicsEstimate(camera, sigma, used)
+    def claim(self, frames: Sequence[WorkingFrame]) -> FocalClaim | None:
+        """Weighted median of the votes; None when no pair shows parallax or a rotation."""
+        return _claim(self.votes(frames))
 
     def votes(self, frames: Sequence[WorkingFrame]) -> list[FocalVote]:
         """One vote for each anchor that found a partner and whose pair could be solved."""
@@ -213,11 +191,11 @@ class TwoViewFocalInit:
         return centres.astype(np.float64), forward.target_px[kept].astype(np.float64), forward.consistent
 
 
-def _combine(votes: Sequence[FocalVote], default_focal: float, default_sigma: float) -> tuple[float, float, int]:
+def _claim(votes: Sequence[FocalVote]) -> FocalClaim | None:
     """Weighted median of log(f), an honest sigma, and the number of votes behind them.
 
-    The vote is blended with the default as two Gaussians. Without parallax, rotations vote in place of the pairs.
-    Pairs that contradict each other (forward driving, moving objects) thereby fall back to the default smoothly.
+    Without parallax, rotations vote in place of the pairs. Pairs that contradict each other (forward driving, moving
+    objects) make the sigma wide.
     """
     weights = np.array([v.weight for v in votes])
     turned = np.array([v.rotation_focal_px for v in votes])
@@ -229,16 +207,13 @@ def _combine(votes: Sequence[FocalVote], default_focal: float, default_sigma: fl
         log_focal, weights = np.sort(np.log(turned)), np.full(len(turned), 0.5)
         floor = _MIN_ROTATION_LOG_SIGMA
     else:
-        return default_focal, default_sigma, 0
+        return None
     median = _weighted_quantile(log_focal, weights, 0.5)
     spread = 1.4826 * _weighted_quantile(*_sorted(np.abs(log_focal - median), weights), 0.5)
     # Pairs share their errors (same scene, same kind of motion), so the spread is not divided by their number; with
     # few or light pairs the spread itself is uncertain.
     sigma = max(floor, spread) * math.sqrt(1 + 1 / float(weights.sum()))
-    information, default_information = 1 / sigma**2, 1 / default_sigma**2
-    total = information + default_information
-    mean = (information * median + default_information * math.log(default_focal)) / total
-    return math.exp(mean), 1 / math.sqrt(total), len(log_focal)
+    return FocalClaim("two views", median, sigma, len(log_focal))
 
 
 def _rotation_focal(homography: NDArray[np.float64], pp: NDArray[np.float64], width: int) -> float:
