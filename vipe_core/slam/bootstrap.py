@@ -20,7 +20,7 @@ import numpy as np
 import poselib
 from numpy.typing import NDArray
 
-from vipe_core.slam.adjustment import FROM_SCRATCH, REFINE, TRACK, Adjuster, Step
+from vipe_core.slam.adjustment import FROM_SCRATCH, REFINE, TRACK, Adjuster, FocalPrior, Step
 from vipe_core.slam.consensus import MIN_WEIGHT, consensus_pose, pinhole_camera
 from vipe_core.slam.masks import MotionMasks
 from vipe_core.slam.measuring import MeasuredGraph
@@ -118,12 +118,15 @@ class Bootstrap:
             self._keyframes.normalise_scale()
 
     def _start_from_each_focal(self) -> None:
-        """A start for every focal length that there is evidence for, adjusted with it free; the cheapest stays."""
+        """A start for every focal length that there is evidence for, adjusted with it free; the cheapest stays.
+
+        The prior moves to the focal length that the cheapest came from, since the measurements refute the others.
+        """
         keyframes = self._keyframes
         everything = range(len(keyframes))
         prior = self._adjuster.focal_prior
         blank = keyframes.snapshot()
-        best: tuple[float, tuple[Array, Array, Array], NDArray[np.bool_]] | None = None
+        best: tuple[float, float, tuple[Array, Array, Array], NDArray[np.bool_]] | None = None
         for log_focal in (prior.log_focal, *prior.rivals):
             keyframes.restore(blank)
             for k in everything:
@@ -136,11 +139,13 @@ class Bootstrap:
             cost = self._cost()
             logger.debug("start at %.1f px: now %.1f, cost %.4f", math.exp(log_focal), keyframes.intrinsics[0], cost)
             if best is None or cost < _CLEARLY_CHEAPER * best[0]:
-                best = cost, keyframes.snapshot(), keyframes.statics()
+                best = cost, log_focal, keyframes.snapshot(), keyframes.statics()
         if best is not None:
-            keyframes.restore(best[1])
+            _, log_focal, snapshot, static = best
+            self._adjuster.focal_prior = FocalPrior(log_focal, prior.sigma)
+            keyframes.restore(snapshot)
             for k in everything:
-                keyframes.set_static(k, best[2][k])
+                keyframes.set_static(k, static[k])
 
     def _cost(self) -> float:
         """Mean robust cost of all measurements, 0..1, whatever the masks say: starts differ in their masks."""

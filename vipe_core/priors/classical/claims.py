@@ -94,7 +94,8 @@ def combine(
     if not claims:
         return default_log_focal, default_sigma, ()
     surest = min(claims, key=lambda claim: claim.sigma)
-    agreeing, rivals = [], []
+    agreeing: list[FocalClaim] = []
+    rivals: list[FocalClaim] = []
     for claim in claims:
         apart = abs(claim.log_focal - surest.log_focal)
         (rivals if apart > _CONTRADICTION * math.hypot(claim.sigma, surest.sigma) else agreeing).append(claim)

@@ -90,7 +90,7 @@ def segments(frame: WorkingFrame) -> Array:
     found = (lines.reshape(-1, 4).astype(np.float64) - centre) / width
     length = np.hypot(found[:, 2] - found[:, 0], found[:, 3] - found[:, 1])
     order = np.argsort(-length, kind="stable")[:_MAX_SEGMENTS]
-    return found[order[length[order] > _MIN_LENGTH]]
+    return np.asarray(found[order[length[order] > _MIN_LENGTH]], dtype=np.float64)
 
 
 def _profile(found: Array, focal: Array) -> Array | None:
@@ -131,11 +131,11 @@ def _vanishing_points(found: Array) -> Array:
     points = np.cross(lines[pairs[:, 0]], lines[pairs[:, 1]])
     norm = np.linalg.norm(points, axis=1)
     points = points[norm > 1e-9] / norm[norm > 1e-9, None]
-    close = _distance(found, points) < _TOLERANCE
-    score = close @ length
+    close: NDArray[np.bool_] = _distance(found, points) < _TOLERANCE
+    score = np.asarray(close @ length, dtype=np.float64)
     chosen: list[Array] = []
     taken: list[NDArray[np.bool_]] = []
-    for k in np.argsort(-score, kind="stable"):
+    for k in np.argsort(-score, kind="stable").tolist():
         inside = close[k]
         if inside.sum() < 3 or len(chosen) == _MAX_POINTS:
             break
@@ -149,7 +149,7 @@ def _vanishing_points(found: Array) -> Array:
 
 def _fit(found: Array, points: Array) -> Array:
     """(V, S) 0..1, how well each segment points at each vanishing point."""
-    return np.maximum(0.0, 1 - np.square(_distance(found, points) / _TOLERANCE))
+    return np.asarray(np.maximum(0.0, 1 - np.square(_distance(found, points) / _TOLERANCE)), dtype=np.float64)
 
 
 def _distance(found: Array, points: Array) -> Array:
@@ -158,4 +158,4 @@ def _distance(found: Array, points: Array) -> Array:
     lines = np.cross(points[:, None], middle[None])
     norm = np.maximum(np.hypot(lines[..., 0], lines[..., 1]), 1e-12)
     half = (found[:, 2:] - found[:, :2]) / 2
-    return np.abs(lines[..., 0] * half[:, 0] + lines[..., 1] * half[:, 1]) / norm
+    return np.asarray(np.abs(lines[..., 0] * half[:, 0] + lines[..., 1] * half[:, 1]) / norm, dtype=np.float64)
