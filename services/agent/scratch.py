@@ -4,7 +4,7 @@
         shard.json              what the artifacts were made from and by: adopted only if all of it is equal
         input/                  fetched inputs, one at a time
         staging/                artifacts of the running video; wiped before each video
-        artifacts/              artifacts of finished videos: pose/ intrinsics/ depth/ rgb/
+        artifacts/              artifacts of finished videos: pose/ intrinsics/ depth/ rgb/ mask/
         results/<key>.json      written last, and atomically: the video is finished and its artifacts are complete
         tars/                   tars in the making
 

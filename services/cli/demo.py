@@ -221,7 +221,7 @@ def _say_what_next(console: Console, output: Path) -> None:
     lines = (
         ("Look at the result:", ""),
         (f"  {here}/pictures/", "frames, depth and camera path of each video in one PNG"),
-        (f"  {here}/artifacts/", "pose/ intrinsics/ depth/ rgb/, as nvidia-vipe lays them out"),
+        (f"  {here}/artifacts/", "pose/ intrinsics/ depth/ rgb/ mask/, as nvidia-vipe lays them out"),
         (f"  {here}/dataset/", "webdataset tars, meta.parquet, failures.parquet, dataset.json"),
         ("Go on:", ""),
         (f"  {vipectl} verify {here}/dataset --deep", ""),
