@@ -133,6 +133,10 @@ ProgressCallback = Callable[[Progress], None]
 MASK_PHRASES = {0: "background", 1: "moving"}
 """What the ids of a mask stand for."""
 
+MEASURED, FILLED, SKY, MOVING, UNOBSERVED = range(5)
+"""Where the depth of a pixel comes from: several views agree on it; it is filled in from what is around it; it is sky,
+at the far end; it moves by itself, and is filled in from what it touches; nothing is known around it."""
+
 
 @dataclass(frozen=True, slots=True)
 class DenseFrame:
@@ -144,6 +148,7 @@ class DenseFrame:
         depth: (H, W) float32 in units of the trajectory; 0 where there is no value.
         confidence: (H, W) float32 in 0..1: 0 is a value that was filled in, not measured.
         mask: (H, W) uint8 instance ids, `MASK_PHRASES` says of what; 0 is the static background.
+        kind: (H, W) uint8, where the depth comes from: `MEASURED`, `FILLED`, `SKY`, `MOVING` or `UNOBSERVED`.
     """
 
     index: int
@@ -151,6 +156,7 @@ class DenseFrame:
     depth: NDArray[np.float32]
     confidence: NDArray[np.float32]
     mask: NDArray[np.uint8]
+    kind: NDArray[np.uint8]
 
 
 @dataclass(frozen=True, slots=True)

@@ -25,7 +25,7 @@ import numpy as np
 
 from services.agent.engine import ProgressCallback, index_row
 from services.domain.models import JobSpec, VideoRef, VideoResult
-from vipe_core.annotation import Annotation, DenseFrame, Provenance, Quality
+from vipe_core.annotation import MEASURED, Annotation, DenseFrame, Provenance, Quality
 from vipe_core.cameras import Camera
 from vipe_core.errors import ConfigError, CorruptMedia, DecodeCrashed
 from vipe_core.formats import write_artifacts
@@ -105,7 +105,8 @@ def fake_annotation(name: str, frames: int) -> Annotation:
         for index in range(frames):
             shape = (HEIGHT, WIDTH)
             rgb, depth = np.zeros((*shape, 3), np.uint8), np.full(shape, 2.0, np.float32)
-            yield DenseFrame(index, rgb, depth, np.ones(shape, np.float32), np.zeros(shape, np.uint8))
+            mask, kind = np.zeros(shape, np.uint8), np.full(shape, MEASURED, np.uint8)
+            yield DenseFrame(index, rgb, depth, np.ones(shape, np.float32), mask, kind)
 
     return Annotation(
         name=name,

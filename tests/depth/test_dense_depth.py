@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 
 import cv2
@@ -10,9 +11,11 @@ import pytest
 
 from vipe_core.cameras import Camera
 from vipe_core.depth.stream import DenseDepth
-from vipe_core.depth.types import DepthFrame, DepthSettings, SceneMap
+from vipe_core.depth.types import MEASURED, MOVING, DepthFrame, DepthSettings, SceneMap
 from vipe_core.errors import EngineError
 from vipe_core.evaluation.synthetic import SyntheticClip, tiny_clip
+from vipe_core.slam.segmentation import MOVING as SOMETHING_MOVES
+from vipe_core.slam.segmentation import STATIC
 from vipe_core.video.source import Frame, FrameStream, VideoInfo
 
 SETTINGS = DepthSettings(window_frames=20)
@@ -191,3 +194,19 @@ def test_same_input_same_bytes(sideways: SyntheticClip, depth_of_sideways: list[
         assert frame.depth.tobytes() == before.depth.tobytes()
         assert frame.confidence.tobytes() == before.confidence.tobytes()
     again.close()
+
+
+def test_every_pixel_says_where_its_depth_comes_from(
+    sideways: SyntheticClip, depth_of_sideways: list[DepthFrame]
+) -> None:
+    for frame in depth_of_sideways:
+        assert frame.kind.dtype == np.uint8
+        assert np.array_equal(frame.kind == MEASURED, frame.confidence > 0)
+        assert not frame.moving.any()
+    labels = np.full((len(sideways.rgb), 30 * 40), STATIC, np.int8)
+    labels.reshape(-1, 30, 40)[:, 10:18, 12:22] = SOMETHING_MOVES
+    scene = dataclasses.replace(scene_of(sideways), labels=labels)
+    frame = next(DenseDepth(SETTINGS).stream(ClipSource(sideways.rgb), scene))
+    assert np.array_equal(frame.kind == MOVING, frame.moving)
+    assert frame.moving[88:136, 104:168].mean() > 0.5
+    assert not frame.moving[:60].any()

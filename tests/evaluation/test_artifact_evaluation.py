@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from benchmarks import accuracy
-from vipe_core.annotation import Annotation, DenseFrame, Provenance, Quality
+from vipe_core.annotation import MEASURED, Annotation, DenseFrame, Provenance, Quality
 from vipe_core.cameras import Camera, CameraModel
 from vipe_core.errors import FormatError
 from vipe_core.evaluation.artifact_sheet import artifact_sheet
@@ -41,6 +41,7 @@ def annotation_of(clip: SyntheticClip, name: str, camera: Camera) -> Annotation:
                 depth[k].astype(np.float32),
                 np.ones(depth[k].shape, np.float32),
                 clip.dynamic[k].astype(np.uint8),
+                np.full(depth[k].shape, MEASURED, np.uint8),
             )
 
     count = len(clip.rgb)

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from vipe_core.annotation import Annotation, DenseFrame, Provenance, Quality
+from vipe_core.annotation import MEASURED, UNOBSERVED, Annotation, DenseFrame, Provenance, Quality
 from vipe_core.cameras import Camera
 
 WIDTH, HEIGHT = 48, 32
@@ -30,7 +30,8 @@ def make_annotation(
         for index in range(num_frames if dense_frames is None else dense_frames):
             rgb = np.full((HEIGHT, WIDTH, 3), 20 + 10 * index, np.uint8)
             depth = depth_of(index)
-            yield DenseFrame(index, rgb, depth, (depth > 0).astype(np.float32), (depth > 1).astype(np.uint8))
+            kind = np.where(depth > 0, MEASURED, UNOBSERVED).astype(np.uint8)
+            yield DenseFrame(index, rgb, depth, (depth > 0).astype(np.float32), (depth > 1).astype(np.uint8), kind)
 
     angles = np.linspace(0, 0.5, num_frames)
     poses = np.tile(np.eye(4), (num_frames, 1, 1))

@@ -9,18 +9,21 @@ from __future__ import annotations
 
 from collections.abc import Generator, Iterator
 from contextlib import closing
+from dataclasses import dataclass
 from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from vipe_core.ba.problem import Grid
 from vipe_core.depth.completion import complete
 from vipe_core.depth.geometry import KeyframePrior, Prior, choose_sources, relative
 from vipe_core.depth.kernels import check, upsample
 from vipe_core.depth.sweep import PlaneSweep, RawDepth
-from vipe_core.depth.types import DepthFrame, DepthSettings, SceneMap
+from vipe_core.depth.types import FILLED, MEASURED, MOVING, UNOBSERVED, DepthFrame, DepthSettings, SceneMap
 from vipe_core.errors import EngineError
+from vipe_core.slam.segmentation import segment
 from vipe_core.video.source import Frame, FrameSource
 
 Array = NDArray[Any]
@@ -34,6 +37,19 @@ _LEAST_WEIGHT = 0.2
 _PRIOR_SHARE = 0.3
 # Enlarging: grey levels that lower a weight by e, and the relative difference that is still the same surface.
 _EDGE, _SAME = 6.0, 0.05
+
+
+@dataclass(frozen=True, slots=True)
+class _Picture:
+    """A frame at half of the working size.
+
+    Attributes:
+        gray: (h, w) uint8.
+        moving: (h, w) bool, what moves by itself or must not be used.
+    """
+
+    gray: NDArray[np.uint8]
+    moving: NDArray[np.bool_]
 
 
 class DenseDepth:
@@ -57,7 +73,7 @@ class DenseDepth:
         size = (scene.camera.width, scene.camera.height)
         reach = max(settings.check_frames, default=0)
         sweep, keyframes = PlaneSweep(scene, settings), KeyframePrior(scene)
-        halves: dict[int, Array] = {}
+        pictures: dict[int, _Picture] = {}
         raws: dict[int, RawDepth] = {}
         priors: dict[int, Prior] = {}
         with closing(source.frames(size=size)) as ahead, closing(source.frames()) as behind:
@@ -65,23 +81,23 @@ class DenseDepth:
             for t in range(num_frames + reach):
                 if t < num_frames:
                     while decoded < min(num_frames, t + settings.window_frames + 1):
-                        halves[decoded] = _half_gray(_next(ahead, decoded, num_frames))
+                        pictures[decoded] = _half(_next(ahead, decoded, num_frames), scene)
                         decoded += 1
                     priors[t] = keyframes.of(t)
                     chosen = choose_sources(scene, sweep.coarse, priors[t], t, settings)
-                    raws[t] = sweep.depth(t, halves[t], {j: halves[j] for j in chosen}, priors[t])
+                    raws[t] = sweep.depth(t, pictures[t].gray, {j: pictures[j].gray for j in chosen}, priors[t])
                 done = t - reach
                 if done >= 0:
-                    picture = _next(behind, done, num_frames)
-                    yield self._finish(done, picture, halves[done], raws, priors.pop(done), scene, sweep)
+                    frame = _next(behind, done, num_frames)
+                    yield self._finish(done, frame, pictures[done], raws, priors.pop(done), scene, sweep)
                     raws.pop(done - reach, None)
-                halves.pop(min(t, done) - settings.window_frames, None)
+                pictures.pop(min(t, done) - settings.window_frames, None)
 
     def _finish(
         self,
         index: int,
-        picture: Frame,
-        half: Array,
+        frame: Frame,
+        picture: _Picture,
         raws: dict[int, RawDepth],
         prior: Prior,
         scene: SceneMap,
@@ -89,8 +105,8 @@ class DenseDepth:
     ) -> DepthFrame:
         """Confirms, fuses, fills and enlarges the depth of one frame."""
         settings, view, raw = self._settings, sweep.fine, raws[index]
-        gray = half.astype(np.float32)
-        height, width = half.shape
+        gray = picture.gray.astype(np.float32)
+        height, width = gray.shape
         prior_value = cv2.resize(prior.inverse_depth, (width, height), interpolation=cv2.INTER_LINEAR)
         prior_trust = cv2.resize(prior.confidence, (width, height), interpolation=cv2.INTER_LINEAR)
         if raw.measured:
@@ -128,15 +144,32 @@ class DenseDepth:
             value = complete(value, weight, gray, prior_value)
         else:
             value, confidence = prior_value, (_PRIOR_SHARE * prior_trust).astype(np.float32)
+        filled = FILLED if raw.measured or prior_trust.any() else UNOBSERVED
         value = np.clip(value, 0.2 * prior.low, 4 * prior.high).astype(np.float32)
-        full_gray = cv2.cvtColor(picture.rgb, cv2.COLOR_RGB2GRAY)
+        full_gray = cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY)
         depth, sure = upsample(value, confidence, gray, full_gray, _EDGE, _SAME)
-        return DepthFrame(index, picture.rgb, depth, np.clip(sure, 0, 1), picture.masked)
+        moving = _enlarged(picture.moving, full_gray.shape)
+        if frame.masked is not None:
+            moving |= frame.masked
+        kind = np.where(moving, MOVING, np.where(sure > 0, MEASURED, filled)).astype(np.uint8)
+        return DepthFrame(index, frame.rgb, depth, np.clip(sure, 0, 1), kind, moving)
 
 
-def _half_gray(frame: Frame) -> NDArray[np.uint8]:
-    gray = cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY)
-    return np.asarray(cv2.resize(gray, (gray.shape[1] // 2, gray.shape[0] // 2), interpolation=cv2.INTER_AREA))
+def _half(frame: Frame, scene: SceneMap) -> _Picture:
+    height, width = frame.rgb.shape[0] // 2, frame.rgb.shape[1] // 2
+    rgb = np.asarray(cv2.resize(frame.rgb, (width, height), interpolation=cv2.INTER_AREA), np.uint8)
+    moving = np.zeros((height, width), np.bool_)
+    if scene.labels is not None:
+        grid = Grid(scene.camera.height // 8, scene.camera.width // 8)
+        moving |= segment(rgb, scene.labels[frame.index], grid) > 0
+    if frame.masked is not None:
+        moving |= cv2.resize(frame.masked.astype(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST) > 0
+    return _Picture(np.asarray(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), np.uint8), moving)
+
+
+def _enlarged(mask: NDArray[np.bool_], shape: tuple[int, ...]) -> NDArray[np.bool_]:
+    share = cv2.resize(mask.astype(np.float32), (shape[1], shape[0]), interpolation=cv2.INTER_LINEAR)
+    return np.asarray(share > 0.5)
 
 
 def _next(frames: Iterator[Frame], index: int, num_frames: int) -> Frame:

@@ -8,6 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from vipe_core.annotation import FILLED as FILLED
+from vipe_core.annotation import MEASURED as MEASURED
+from vipe_core.annotation import MOVING as MOVING
+from vipe_core.annotation import SKY as SKY
+from vipe_core.annotation import UNOBSERVED as UNOBSERVED
 from vipe_core.cameras import Camera
 
 
@@ -64,6 +69,8 @@ class SceneMap:
         inverse_depth: (K, h/8, w/8) float32 along the rays of the camera model, sampled at the centres of 8 x 8 blocks.
         confidence: (K, h/8, w/8) float32 in 0..1; 0 where nothing was measured or where something moves.
         cuts: First frames of the shots but the first. Frames of different shots say nothing about each other.
+        labels: (N, h/8 * w/8) int8 for each cell of each frame, what `slam.segmentation` makes masks of moving things
+            from; None where nothing is known to move.
     """
 
     camera: Camera
@@ -72,6 +79,7 @@ class SceneMap:
     inverse_depth: NDArray[np.float32]
     confidence: NDArray[np.float32]
     cuts: tuple[int, ...] = ()
+    labels: NDArray[np.int8] | None = None
 
     def __post_init__(self) -> None:
         cells = (len(self.keyframes), self.camera.height // 8, self.camera.width // 8)
@@ -99,11 +107,13 @@ class DepthFrame:
         depth: (H, W) float32, finite and positive on every pixel, in units of the trajectory: z for pinhole, distance
             for the other models.
         confidence: (H, W) float32 in 0..1; 0 is a value that was filled in.
-        masked: (H, W) bool, what the frame itself says must not be used, or None.
+        kind: (H, W) uint8, where the value comes from: `MEASURED`, `FILLED`, `SKY`, `MOVING` or `UNOBSERVED`.
+        moving: (H, W) bool, what moves by itself, and what the frame itself says must not be used.
     """
 
     index: int
     rgb: NDArray[np.uint8]
     depth: NDArray[np.float32]
     confidence: NDArray[np.float32]
-    masked: NDArray[np.bool_] | None = None
+    kind: NDArray[np.uint8]
+    moving: NDArray[np.bool_]

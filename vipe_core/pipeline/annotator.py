@@ -20,7 +20,6 @@ from vipe_core.pipeline.presets import Preset, resolve
 from vipe_core.pipeline.provenance import engine_version, library_versions
 from vipe_core.priors.classical import classical_priors
 from vipe_core.quality import assess
-from vipe_core.slam.segmentation import segment
 from vipe_core.slam.system import Slam, SlamResult
 from vipe_core.video import MaskedView, open_source
 from vipe_core.video.source import FrameSource
@@ -147,15 +146,12 @@ class Annotator:
                 start_s = time.perf_counter()
                 with _typed_errors(source, report):
                     frame = next(frames, None)
-                    if frame is not None:
-                        mask = segment(frame.rgb, result.trajectory.labels[frame.index], result.grid)
-                        if frame.masked is not None:
-                            mask[frame.masked] = 1
                 spent_s += time.perf_counter() - start_s
                 timings["depth"] = spent_s
                 if frame is None:
                     return
-                yield DenseFrame(frame.index, frame.rgb, frame.depth, frame.confidence, mask)
+                mask = frame.moving.astype(np.uint8)
+                yield DenseFrame(frame.index, frame.rgb, frame.depth, frame.confidence, mask, frame.kind)
                 report("depth", frame.index + 1, total)
 
 
@@ -203,6 +199,7 @@ def _scene(result: SlamResult) -> SceneMap:
         inverse_depth=result.inverse_depth.reshape(shape),
         confidence=np.where(result.static, result.map.confidence, np.float32(0)).reshape(shape),
         cuts=result.cuts,
+        labels=result.trajectory.labels,
     )
 
 
