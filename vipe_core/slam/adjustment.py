@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -16,7 +16,7 @@ import torch
 from numpy.typing import NDArray
 
 from vipe_core.ba import solve
-from vipe_core.ba.problem import Free, Options, Priors, Problem, Result, RobustKernel, State, Status
+from vipe_core.ba.problem import Free, Grid, Options, Priors, Problem, Result, RobustKernel, State, Status
 from vipe_core.slam.graph import Graph
 from vipe_core.slam.keyframes import KeyframeMap
 from vipe_core.slam.settings import SlamSettings
@@ -27,6 +27,9 @@ logger = logging.getLogger(__name__)
 Array = NDArray[Any]
 
 _MIN_ROBUST_SCALE_PX = 1.0
+PROBED_SHARE = 0.25
+"""Share of the cells that `Adjuster.probe` takes."""
+
 _FAILED = (Status.SINGULAR, Status.NON_FINITE)
 
 
@@ -38,23 +41,29 @@ class Step:
         robust: Kernel of the residual norm.
         scale: Its scale as a multiple of `SlamSettings.robust_scale_px`.
         iterations: Bound on solver steps.
+        tolerance: The solve goes on while a step lowers the cost by at least this share.
     """
 
     robust: RobustKernel
     scale: float
     iterations: int
+    tolerance: float = 1e-2
 
 
-FROM_SCRATCH = (Step("huber", 1.0, 12), Step("geman_mcclure", 4.0, 8), Step("geman_mcclure", 1.0, 8))
+FROM_SCRATCH = (
+    Step("huber", 1.0, 12),
+    Step("geman_mcclure", 4.0, 8),
+    Step("geman_mcclure", 1.0, 8, 1e-3),
+)
 """The start may be anything: a convex kernel first."""
 
-TRACK = (Step("geman_mcclure", 4.0, 4), Step("geman_mcclure", 1.0, 4))
+TRACK = (Step("geman_mcclure", 4.0, 4), Step("geman_mcclure", 1.0, 4, 1e-3))
 """One new pose that motion-only tracking has brought within a few pixels."""
 
-REFINE = (Step("geman_mcclure", 4.0, 10), Step("geman_mcclure", 1.0, 15))
+REFINE = (Step("geman_mcclure", 4.0, 10), Step("geman_mcclure", 1.0, 15, 1e-3))
 """Everything is near its place."""
 
-SETTLE = (Step("geman_mcclure", 1.0, 15),)
+SETTLE = (Step("geman_mcclure", 1.0, 15, 1e-4),)
 """Everything is in its place but for the last digit."""
 
 
@@ -115,6 +124,46 @@ class Adjuster:
         edges = graph.among(frames) if edges is None else list(edges)
         if not edges:
             return None
+        problem, state = self._pose_problem(
+            keyframes, graph, frames, fixed_poses, edges, free_focal=free_focal, free_depth=free_depth
+        )
+        result = self.anneal(problem, state, schedule)
+        if result is None:
+            return None
+        new_poses = result.state.cam_from_world.cpu().numpy()
+        new_depths = result.state.inverse_depth.cpu().numpy()
+        for row, k in enumerate(frames):
+            keyframes.set_pose(k, new_poses[row])
+            keyframes.set_depth(k, new_depths[row])
+        keyframes.intrinsics = result.state.intrinsics.cpu().numpy().astype(np.float64)
+        return result
+
+    def probe(
+        self,
+        keyframes: KeyframeMap,
+        graph: Graph,
+        frames: Sequence[int],
+        fixed_poses: Sequence[int],
+        schedule: Sequence[Step],
+    ) -> Result | None:
+        """What adjusting `frames` with a free focal length would come to, by a quarter of the cells; the map stays."""
+        edges = graph.among(frames)
+        if not edges:
+            return None
+        whole = self._pose_problem(keyframes, graph, frames, fixed_poses, edges, free_focal=True, free_depth=True)
+        return self.anneal(*_thinned(*whole), schedule)
+
+    def _pose_problem(
+        self,
+        keyframes: KeyframeMap,
+        graph: Graph,
+        frames: Sequence[int],
+        fixed_poses: Sequence[int],
+        edges: list[tuple[int, int]],
+        *,
+        free_focal: bool,
+        free_depth: bool,
+    ) -> tuple[Problem, State]:
         number = {k: row for row, k in enumerate(frames)}
         held = set(fixed_poses)
         poses = np.stack([keyframes.pose(k) for k in frames])
@@ -141,17 +190,7 @@ class Adjuster:
                 log_focal_sigma=self.focal_prior.sigma / self.settings.focal_sigma_inflation,
             ),
         )
-        state = self._state(poses, depths, keyframes.intrinsics)
-        result = self.anneal(problem, state, schedule)
-        if result is None:
-            return None
-        new_poses = result.state.cam_from_world.cpu().numpy()
-        new_depths = result.state.inverse_depth.cpu().numpy()
-        for row, k in enumerate(frames):
-            keyframes.set_pose(k, new_poses[row])
-            keyframes.set_depth(k, new_depths[row])
-        keyframes.intrinsics = result.state.intrinsics.cpu().numpy().astype(np.float64)
-        return result
+        return problem, self._state(poses, depths, keyframes.intrinsics)
 
     def anneal(self, problem: Problem, state: State, schedule: Sequence[Step]) -> Result | None:
         """Solve with each kernel of the schedule in turn; None when the very first solve fails."""
@@ -162,7 +201,7 @@ class Adjuster:
                 max_iterations=step.iterations,
                 robust=step.robust,
                 robust_scale_px=step.scale * self.robust_scale_px,
-                relative_tolerance=1e-3 if step is not schedule[-1] else 1e-4,
+                relative_tolerance=step.tolerance,
             )
             solved = solve(problem, state if result is None else result.state, options)
             if solved.status is Status.EMPTY:
@@ -198,6 +237,24 @@ class Adjuster:
         median = max(float(np.median(depths)), 1e-6)
         information = np.full(depths.shape, self._depth_prior_weight / median**2, dtype=np.float32)
         return torch.from_numpy(prior).to(self.device), torch.from_numpy(information).to(self.device)
+
+
+def _thinned(problem: Problem, state: State) -> tuple[Problem, State]:
+    """The same with every other cell of every other row."""
+    grid = problem.grid
+    kept = torch.arange(grid.num_cells, device=state.inverse_depth.device).reshape(grid.height, grid.width)[::2, ::2]
+    cells = kept.reshape(-1)
+    edges, priors = problem.edges, problem.priors
+    if priors.inverse_depth is not None and priors.inverse_depth_weight is not None:
+        priors = replace(
+            priors,
+            inverse_depth=priors.inverse_depth[:, cells],
+            inverse_depth_weight=priors.inverse_depth_weight[:, cells],
+        )
+    edges = replace(edges, target_px=edges.target_px[:, cells], weight=edges.weight[:, cells])
+    coarse = Grid(kept.shape[0], kept.shape[1], 2 * grid.stride, grid.offset)
+    thin = replace(problem, grid=coarse, edges=edges, priors=priors)
+    return thin, replace(state, inverse_depth=state.inverse_depth[:, cells])
 
 
 def _nothing() -> None:

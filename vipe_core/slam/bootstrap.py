@@ -31,7 +31,7 @@ logger = logging.getLogger(__name__)
 
 Array = NDArray[Any]
 
-POSE_ONLY = (Step("huber", 1.0, 8), Step("geman_mcclure", 2.0, 8), Step("geman_mcclure", 1.0, 4))
+POSE_ONLY = (Step("huber", 1.0, 8), Step("geman_mcclure", 2.0, 8), Step("geman_mcclure", 1.0, 4, 1e-3))
 """A motion-only fit whose start may be off by a whole keyframe step."""
 
 _MAX_SEEDS = 3

@@ -14,13 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vipe_core.ba.problem import Result
-from vipe_core.slam.adjustment import Adjuster, Step
+from vipe_core.slam.adjustment import PROBED_SHARE, Adjuster, Step
 from vipe_core.slam.graph import Graph
 from vipe_core.slam.keyframes import KeyframeMap
 
 logger = logging.getLogger(__name__)
 
-_PROBE = (Step("geman_mcclure", 1.0, 12),)
+_PROBE = (Step("geman_mcclure", 1.0, 12, 1e-4),)
 _MIN_KEYFRAMES = 8
 # More keyframes than this tell no more, and the probes' price is bounded.
 _STRETCH = 32
@@ -42,21 +42,19 @@ def refine_principal_point(keyframes: KeyframeMap, graph: Graph, adjuster: Adjus
     if len(keyframes) < _MIN_KEYFRAMES:
         return False
     frames = _turning_stretch(keyframes.poses())
-    snapshot = keyframes.snapshot()
     width = keyframes.grid.width * keyframes.grid.stride
     start = np.array(keyframes.intrinsics)
     measurements = 1.0
 
     def cost(offset_px: NDArray[np.float64]) -> float:
         """Mean robust cost of a measurement, px^2, and so the variance of one where the map is right."""
-        keyframes.restore(snapshot)
-        keyframes.intrinsics[2:4] += offset_px
-        result: Result | None = adjuster.adjust(keyframes, graph, frames, (frames[0],), _PROBE, free_focal=True)
-        keyframes.restore(snapshot)
+        keyframes.intrinsics = np.concatenate([start[:2], start[2:4] + offset_px, start[4:]])
+        result: Result | None = adjuster.probe(keyframes, graph, frames, (frames[0],), _PROBE)
+        keyframes.intrinsics = start
         nonlocal measurements
         if result is None or not result.weight_sum > 0:
             return float("nan")
-        measurements = result.weight_sum
+        measurements = result.weight_sum / PROBED_SHARE
         return result.cost / result.weight_sum
 
     step = _PROBE_RATIO * width

@@ -27,7 +27,7 @@ from vipe_core.slam.selection import Report
 
 Array = NDArray[Any]
 
-_SCHEDULE = (Step("geman_mcclure", 3.0, 6), Step("geman_mcclure", 1.0, 4))
+_SCHEDULE = (Step("geman_mcclure", 3.0, 6), Step("geman_mcclure", 1.0, 4, 1e-4))
 _MIN_INLIERS = 0.1
 _MIN_WEIGHT = 0.02
 
