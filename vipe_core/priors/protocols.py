@@ -131,7 +131,7 @@ class PointMatcher(Protocol):
         """
 
     def overview(self, features: Any) -> NDArray[np.float32]:
-        """(n, D) descriptors of unit length by which places are recognised; cheaper than those of `correspond`."""
+        """(n, D) descriptors of unit length by which places are recognised."""
 
 
 @dataclass(frozen=True, slots=True)

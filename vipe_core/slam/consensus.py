@@ -34,7 +34,7 @@ MAJORITY = 0.5
 # Squared sine between the baseline and a ray, in units of the squared baseline, below which no depth follows.
 _NO_BASELINE = 1e-18
 _MIN_POINTS = 50
-_MAX_POINTS = 1500
+_MAX_POINTS = 600
 
 
 @dataclass(frozen=True, slots=True)

@@ -14,7 +14,7 @@ from vipe_core.slam.keyframes import KeyframeMap
 from vipe_core.slam.reprojection import Reprojector
 
 # A pair with less forward-backward consistency than this may have been matched from the wrong start.
-_SURE = 0.5
+_SURE = 0.25
 _MIN_POINTS = 20
 # A step to the previous keyframe that is matched with less consistency than this is wide.
 _WIDE_STEP = 0.7

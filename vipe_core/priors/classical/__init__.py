@@ -32,11 +32,10 @@ def classical_priors() -> PriorFamily:
 
     Make one per thread. The number of OpenCV threads is the caller's choice.
     """
-    matcher = DisFlowMatcher()
     return PriorFamily(
-        matcher=matcher,
+        matcher=DisFlowMatcher(),
         tracker=LkTracker(),
         points=SiftMatcher(),
-        intrinsics=CombinedFocalInit((TwoViewFocal(matcher), VanishingFocal())),
+        intrinsics=CombinedFocalInit((TwoViewFocal(), VanishingFocal())),
         aligner=PatchAligner(),
     )

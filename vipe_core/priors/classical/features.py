@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -19,6 +20,7 @@ STRIDE = 8
 """Working pixels per grid cell. Cell (y, x) samples index coordinates (8x + 3.5, 8y + 3.5)."""
 
 _STRUCTURE_BOX_PX = 13
+_KEYPOINT_AREA_PX = 320 * 240
 _MAX_CORNERS = 1000
 _CORNER_TERMINATION = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 20, 0.01)
 _MASK_MARGIN_PX = 4
@@ -104,16 +106,17 @@ class FlowFeatures:
 
     @cached_property
     def keypoints(self) -> Keypoints:
-        """Local features of the whole picture."""
-        return detect(self.gray, self.usable)
-
-    @cached_property
-    def overview(self) -> Keypoints:
-        """Local features of the picture at half its size: coarser, and at a quarter of the price."""
-        height, width = self.half.shape
-        usable = None if self.usable is None else np.asarray(self.usable[: 2 * height : 2, : 2 * width : 2])
-        found = detect(self.half, usable)
-        return Keypoints(2 * found.points_px + np.float32(0.5), found.descriptors)
+        """Local features, of a smaller picture where this one is large: the finest ones are most of the price."""
+        height, width = self.gray.shape
+        shrink = min(1.0, math.sqrt(_KEYPOINT_AREA_PX / (height * width)))
+        size = (round(shrink * width), round(shrink * height))
+        gray = np.asarray(cv2.resize(self.gray, size, interpolation=cv2.INTER_AREA))
+        usable = self.usable
+        if usable is not None:
+            usable = cv2.resize(usable.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST).astype(np.bool_)
+        found = detect(gray, usable)
+        scale = np.array([width / size[0], height / size[1]], np.float32)
+        return Keypoints((found.points_px + np.float32(0.5)) * scale - np.float32(0.5), found.descriptors)
 
 
 def grid_of(gray: Array) -> Grid:

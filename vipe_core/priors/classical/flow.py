@@ -74,10 +74,15 @@ def _motion_only() -> Any:
 
 
 class DisFlowMatcher:
-    """`DenseMatcher` without a network. One instance per thread: OpenCV's flow object owns its buffers."""
+    """`DenseMatcher` without a network. One instance per thread: OpenCV's flow object owns its buffers.
 
-    def __init__(self) -> None:
-        self._medium = _preset(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+    Args:
+        fine: `match` resolves flow to half the picture's size, at four times the price of a quarter: for those who use
+            it as it is. In the map, tracks and patches are finer than either.
+    """
+
+    def __init__(self, *, fine: bool = False) -> None:
+        self._both_ways = _preset(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM if fine else cv2.DISOPTICAL_FLOW_PRESET_FAST)
         self._fast = _preset(cv2.DISOPTICAL_FLOW_PRESET_FAST)
         self._ultrafast = _preset(cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST)
         self._half = _Flow(_motion_only)
@@ -106,8 +111,8 @@ class DisFlowMatcher:
         """Measurements source -> target and target -> source; see `DenseMatcher.match`."""
         guess = _guessed_cells(source, guess_px)
         forward_init, backward_init = _dense_guess(guess, source), _dense_inverse(guess, source)
-        forward = self._refined(self._medium, source.gray, target.gray, forward_init)
-        backward = self._refined(self._medium, target.gray, source.gray, backward_init)
+        forward = self._refined(self._both_ways, source.gray, target.gray, forward_init)
+        backward = self._refined(self._both_ways, target.gray, source.gray, backward_init)
         return _measure(source, target, forward, backward), _measure(target, source, backward, forward)
 
     def match_fast(self, source: FlowFeatures, target: FlowFeatures, guess_px: Array | None = None) -> Match:
@@ -121,19 +126,20 @@ class DisFlowMatcher:
         return _measure(source, target, forward, backward)
 
     def _refined(self, dis: _Flow, source: Array, target: Array, init: Array | None) -> NDArray[np.float32]:
+        """(h, w, 2) flow, searched for around `init`."""
         if init is None:
             return dis.calc(source, target)
         height, width = source.shape
         reach = float(np.median(np.linalg.norm(cell_mean(init), axis=-1)))
-        if reach > _WIDE_MOTION_RATIO * float(np.hypot(height, width)):
-            # Far from zero, DIS may drop the guess at its coarsest scale. Warp the target by the guess, measure the
-            # small residual, and let the flow between the original images (no resampling blur) polish the sum.
-            u, v = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
-            warped = cv2.remap(
-                target, u + init[..., 0], v + init[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
-            )
-            init = init + self._fast.calc(source, warped)
-        return dis.calc(source, target, np.array(init, np.float32, order="C"))
+        if reach <= _WIDE_MOTION_RATIO * float(np.hypot(height, width)):
+            return dis.calc(source, target, np.array(init, np.float32, order="C"))
+        # Far from zero, DIS may drop the guess at its coarsest scale. Warp the target by the guess, measure the small
+        # residual, and let the flow between the original images (no resampling blur) polish the sum.
+        u, v = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
+        warped = cv2.remap(
+            target, u + init[..., 0], v + init[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+        )
+        return dis.calc(source, target, np.array(init + self._fast.calc(source, warped), np.float32, order="C"))
 
 
 def _guessed_cells(source: FlowFeatures, guess_px: Array | None) -> NDArray[np.float32] | None:

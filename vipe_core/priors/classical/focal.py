@@ -62,7 +62,7 @@ class TwoViewFocal:
     Picks anchors and their partners itself and looks at no pair that the motion between them does not call for.
 
     Args:
-        matcher: Dense matcher.
+        matcher: Dense matcher; one of fine flow if None.
         num_anchors: Frames that look for a partner.
         motion_ratio: Wanted median displacement to the partner, share of the image width.
         max_points: Upper bound of correspondences per pair.
@@ -75,7 +75,7 @@ class TwoViewFocal:
         motion_ratio: float = 30 / 640,
         max_points: int = 1500,
     ) -> None:
-        self._matcher = matcher or DisFlowMatcher()
+        self._matcher = matcher or DisFlowMatcher(fine=True)
         self._num_anchors = num_anchors
         self._motion_ratio = motion_ratio
         self._max_points = max_points

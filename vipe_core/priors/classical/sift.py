@@ -33,5 +33,5 @@ class SiftMatcher:
         return Correspondences(source_px[inlier], target_px[inlier])
 
     def overview(self, features: FlowFeatures) -> NDArray[np.float32]:
-        """Descriptors of a coarse look at the frame; see `PointMatcher.overview`."""
-        return features.overview.vectors()
+        """Descriptors of the same keypoints; see `PointMatcher.overview`."""
+        return features.keypoints.vectors()
