@@ -40,6 +40,7 @@ class Quality:
             without any.
         loop_residual_after_px: The same after it.
         loop_moved_ratio: RMS shift of the keyframes by that adjustment, as a share of the path's length.
+        scale_sigma_ratio: 1-sigma of the metres per unit divided by them; NaN where the scale is relative.
     """
 
     reliable: Reliability
@@ -59,6 +60,7 @@ class Quality:
     loop_residual_before_px: float = float("nan")
     loop_residual_after_px: float = float("nan")
     loop_moved_ratio: float = 0.0
+    scale_sigma_ratio: float = float("nan")
 
     def summary(self) -> dict[str, object]:
         """The scalar fields, JSON-ready (no NaN: missing is None)."""
@@ -81,6 +83,7 @@ class Quality:
             "loop_residual_before_px": number(self.loop_residual_before_px),
             "loop_residual_after_px": number(self.loop_residual_after_px),
             "loop_moved_ratio": number(self.loop_moved_ratio),
+            "scale_sigma_ratio": number(self.scale_sigma_ratio),
         }
 
     def per_frame(self) -> dict[str, list[float | None] | list[int]]:
@@ -99,7 +102,11 @@ class Quality:
 
 @dataclass(frozen=True, slots=True)
 class Provenance:
-    """How the result came about. Holds nothing that differs between two runs of the same input, config and device."""
+    """How the result came about. Holds nothing that differs between two runs of the same input, config and device.
+
+    Attributes:
+        scale_source: What the scale was taken from: `normalised`, `metric_depth`, or the user's known length as text.
+    """
 
     engine_version: str
     preset: str
@@ -109,6 +116,7 @@ class Provenance:
     providers: dict[str, str]
     weights: dict[str, str]
     source: dict[str, object]
+    scale_source: str = "normalised"
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,7 +124,8 @@ class Progress:
     """How far an annotation is.
 
     Attributes:
-        stage: `scan`, `intrinsics`, `track`, `backend`, `infill` or `depth`, in this order.
+        stage: `scan`, `intrinsics`, `track`, `backend`, `infill`, `scale` (only with metric depth) or `depth`, in this
+            order.
         frames_done: Frames of the stage that are done.
         frames_total: Frames of the stage, or None while the number is not known.
     """
@@ -169,7 +178,8 @@ class Annotation:
         timestamps_s: (N,) float64 presentation times as the container states them.
         fps: Average frames per second.
         keyframes: (K,) int64 increasing frame indices.
-        scale: `relative` means one unknown scale for poses and depth together.
+        scale: `metric` is metres; `relative` one unknown scale for poses and depth together, in units in which the
+            median inverse depth of the map is 1. `provenance.scale_source` says where it is from.
         depth_kind: `z` along the optical axis, `ray` distance from the centre.
         timings_s: Wall seconds per stage. Filled further while `dense` is consumed; never part of the payload bytes.
         dense: Starts the dense stream: every frame in order, once per call, in bounded memory. Closing it ends its

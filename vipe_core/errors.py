@@ -8,7 +8,8 @@
     │   ├── NoVideoStream         no_video_stream
     │   ├── UnsupportedMedia      media_unsupported
     │   ├── MediaTooLarge         media_too_large
-    │   └── MaskMismatch          mask_mismatch       given masks do not belong to the pictures
+    │   ├── MaskMismatch          mask_mismatch       given masks do not belong to the pictures
+    │   └── ScaleUnobservable     scale_unobservable  the known length cannot be found in the video
     ├── DecodeError           the decoder child is the cause
     │   ├── DecodeTimeout         decode_timeout      (retryable)
     │   └── DecodeCrashed         decode_crashed      (retryable)
@@ -86,6 +87,12 @@ class MaskMismatch(InputError):
     """Masks were given that are not one per picture, or not of the pictures' size."""
 
     code = "mask_mismatch"
+
+
+class ScaleUnobservable(InputError):
+    """A length was given to take the scale from, but the video does not show it: no ground, no motion, no pixel."""
+
+    code = "scale_unobservable"
 
 
 class DecodeError(VipeError):

@@ -77,7 +77,7 @@ class VipeEngine:
         def during(at: EngineProgress) -> None:
             report(at.stage, at.frames_done, at.frames_total)
 
-        annotation = self._annotator.annotate(path, name=video.key, progress=during)
+        annotation = self._annotator.annotate(path, name=video.key, scale_from=spec.scale_from, progress=during)
         write_artifacts(
             annotation, root, attributes=attributes, progress=lambda done, all_: report("depth", done, all_)
         )

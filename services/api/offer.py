@@ -34,6 +34,21 @@ def one_of(value: str, offered: tuple[str, ...]) -> str:
     return value
 
 
+def known_length(value: str) -> str:
+    """Check a known length as the engine takes it.
+
+    Raises:
+        ValueError: It is not understood.
+    """
+    from vipe_core.depth.known import KnownLength
+    from vipe_core.errors import ConfigError
+
+    try:
+        return str(KnownLength.parse(value))
+    except ConfigError as error:
+        raise ValueError(str(error)) from error
+
+
 def address(value: str) -> str:
     """Check an absolute path or `s3://bucket/key`.
 

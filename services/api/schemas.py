@@ -46,6 +46,13 @@ class JobRequest(BaseModel):
         default=1 << 30, ge=1, le=1 << 40, description="Most input bytes in one shard; one video always fits."
     )
     name: str = Field(default="", max_length=200, description="Free text for humans.")
+    scale_from: Annotated[str, AfterValidator(offer.known_length)] | None = Field(
+        default=None,
+        max_length=200,
+        description="A length that is known of every video, which makes scale metric: `path=METRES` that the camera "
+        "goes, `height=METRES` of the camera above the ground, or `depth=METRES@X,Y,FRAME` from the camera to what a "
+        "pixel of a frame shows. A video that does not show it fails with `scale_unobservable`.",
+    )
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
@@ -68,6 +75,7 @@ class JobRequest(BaseModel):
             shard_max_videos=self.shard_max_videos,
             shard_max_input_bytes=self.shard_max_input_bytes,
             name=self.name,
+            scale_from=self.scale_from,
         )
 
 
@@ -84,6 +92,7 @@ class SpecView(_View):
     shard_max_videos: int
     shard_max_input_bytes: int
     name: str
+    scale_from: str | None
 
 
 class ProgressView(_View):

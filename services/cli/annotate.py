@@ -27,6 +27,14 @@ def annotate(
         Path | None,
         typer.Option(metavar="DIR", help="One PNG per frame of the one INPUT; what is not zero in it is not used."),
     ] = None,
+    scale_from: Annotated[
+        str | None,
+        typer.Option(
+            metavar="KNOWN",
+            help="A known length, which makes the scale metric: path=METRES that the camera goes, height=METRES of the "
+            "camera above the ground, or depth=METRES@X,Y,FRAME from the camera to what a pixel of a frame shows.",
+        ),
+    ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="One JSON line per input on stdout, nothing else.")] = False,
 ) -> None:
     """Annotate videos on this machine, without the service.
@@ -35,12 +43,18 @@ def annotate(
     """
     from rich.console import Console
 
-    from vipe_core.errors import VipeError
+    from vipe_core.depth.known import KnownLength
+    from vipe_core.errors import ConfigError, VipeError
     from vipe_core.formats import SequenceNames
     from vipe_core.pipeline.annotator import Annotator
 
     if masks is not None and len(inputs) > 1:
         raise typer.BadParameter(f"the masks are of one input, not of {len(inputs)}", param_hint="--masks")
+    if scale_from is not None:
+        try:
+            KnownLength.parse(scale_from)
+        except ConfigError as error:
+            raise typer.BadParameter(str(error), param_hint="--scale-from") from error
     console = Console(stderr=True, quiet=as_json)
     annotator = Annotator(preset=preset, camera=camera, device=device)
     names = SequenceNames(output)
@@ -48,7 +62,7 @@ def annotate(
     for path in inputs:
         started = time.perf_counter()
         try:
-            row = _annotate_one(annotator, path, output, names.name_for(path), masks, console)
+            row = _annotate_one(annotator, path, output, names.name_for(path), masks, scale_from, console)
             row["seconds"] = round(time.perf_counter() - started, 3)
             row["frames_per_s"] = round(row["num_frames"] / row["seconds"], 3)
         except VipeError as error:
@@ -69,7 +83,13 @@ def annotate(
 
 
 def _annotate_one(
-    annotator: Annotator, path: Path, output: Path, name: str, masks: Path | None, console: Any
+    annotator: Annotator,
+    path: Path,
+    output: Path,
+    name: str,
+    masks: Path | None,
+    scale_from: str | None,
+    console: Any,
 ) -> dict[str, Any]:
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
@@ -89,7 +109,7 @@ def _annotate_one(
         def report(progress: EngineProgress) -> None:
             bars.update(task, description=progress.stage, completed=progress.frames_done, total=progress.frames_total)
 
-        annotation = annotator.annotate(path, name=name, masks=masks, progress=report)
+        annotation = annotator.annotate(path, name=name, masks=masks, scale_from=scale_from, progress=report)
 
         def written(done: int, total: int) -> None:
             bars.update(task, description="depth", completed=done, total=total)
@@ -112,6 +132,7 @@ def _row(path: Path, annotation: Annotation, output: Path) -> dict[str, Any]:
         "fov_x_deg": round(annotation.camera.fov_x_deg, 4),
         "trajectory_length": round(annotation.trajectory_length, 6),
         "scale": annotation.scale,
+        "scale_source": annotation.provenance.scale_source,
         "quality": annotation.quality.summary(),
         "timings_s": {stage: round(seconds, 3) for stage, seconds in annotation.timings_s.items()},
     }

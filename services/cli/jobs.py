@@ -39,6 +39,10 @@ def submit(
     preset: str = "classical",
     camera: str = "pinhole",
     name: str = "",
+    scale_from: Annotated[
+        str | None,
+        typer.Option(metavar="KNOWN", help="A known length of every video, as `vipectl annotate --scale-from`."),
+    ] = None,
     key: Annotated[
         str | None, typer.Option("--idempotency-key", help="The same key and job is never run twice.")
     ] = None,
@@ -56,6 +60,8 @@ def submit(
         "camera": camera,
         "name": name,
     }
+    if scale_from is not None:
+        spec["scale_from"] = scale_from
     job = client.submit(spec, idempotency_key=key)
     if as_json:
         _print_json(job)

@@ -27,6 +27,8 @@ class JobSpec:
         shard_max_videos: Most videos in one shard.
         shard_max_input_bytes: Most input bytes in one shard (a stand-in for cost; one video always fits).
         name: Free text for humans.
+        scale_from: A length that is known of every video of the job, which makes their scale metric, as `annotate`
+            takes it.
     """
 
     inputs: tuple[str, ...]
@@ -37,11 +39,14 @@ class JobSpec:
     shard_max_videos: int = 16
     shard_max_input_bytes: int = 1 << 30
     name: str = ""
+    scale_from: str | None = None
 
     @property
     def config_hash(self) -> str:
         """sha256 of what decides the payload bytes of a video, not of where they come from or go."""
-        config = {"preset": self.preset, "camera": self.camera, "attributes": list(self.attributes)}
+        config: dict[str, Any] = {"preset": self.preset, "camera": self.camera, "attributes": list(self.attributes)}
+        if self.scale_from is not None:
+            config["scale_from"] = self.scale_from
         return hashlib.sha256(json.dumps(config, sort_keys=True).encode()).hexdigest()
 
     def to_json(self) -> dict[str, Any]:

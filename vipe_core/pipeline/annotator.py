@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import logging
 import time
 from collections.abc import Generator, Iterator
@@ -12,12 +13,15 @@ import numpy as np
 import torch
 
 from vipe_core.annotation import Annotation, DenseFrame, Progress, ProgressCallback, Provenance
+from vipe_core.depth.known import KnownLength
 from vipe_core.depth.stream import DenseDepth
 from vipe_core.depth.types import SceneMap
 from vipe_core.errors import EngineError, VipeError
 from vipe_core.pipeline.device import describe_device, resolve_device, set_threads
 from vipe_core.pipeline.presets import Preset, resolve
 from vipe_core.pipeline.provenance import engine_version, library_versions
+from vipe_core.pipeline.providers import open_depth
+from vipe_core.pipeline.scaling import ScaledScene, set_scale
 from vipe_core.priors.classical import classical_priors
 from vipe_core.quality import assess
 from vipe_core.slam.system import Slam, SlamResult
@@ -53,6 +57,7 @@ class Annotator:
         self.device = resolve_device(device)
         self.threads = threads
         set_threads(threads)
+        self._depth = open_depth(self.preset.depth, self.device)
 
     def annotate(
         self,
@@ -60,6 +65,7 @@ class Annotator:
         *,
         name: str | None = None,
         masks: str | Path | None = None,
+        scale_from: str | None = None,
         progress: ProgressCallback | None = None,
     ) -> Annotation:
         """Poses, camera and quality of a video file or a directory of images; dense depth when it is asked for.
@@ -69,13 +75,19 @@ class Annotator:
             name: Name of the sequence; the sanitised stem if None. Frames from elsewhere have theirs.
             masks: Directory of PNGs, one per frame, named like the pictures or by the number of the frame from 0: what
                 is not zero in them is not used to find poses, camera and map, and is part of the masks that come out.
+            scale_from: A length that is known, which makes the scale metric: `path=12.3` (metres that the camera goes),
+                `height=1.6` (of the camera above the ground, which must be in view) or `depth=2.4@x,y,frame` (from the
+                camera to what a pixel of a frame shows). Without one, and without metric depth, scale is relative.
             progress: Told how far the annotation is; an exception out of it ends the annotation.
 
         Raises:
             InputError, DecodeError: The input cannot be read, or the masks are not of this video (MaskMismatch). Code
                 and message are meant for the user.
+            ScaleUnobservable: The video does not show the known length.
+            ConfigError: `scale_from` is not understood.
             EngineError: A stage failed, a defect of ours; what went wrong is its `__cause__`. So does the dense stream.
         """
+        known = None if scale_from is None else KnownLength.parse(scale_from)
         source = open_source(video, name=name) if isinstance(video, (str, Path)) else video
         if masks is not None:
             source = MaskedView(source, masks)
@@ -87,6 +99,8 @@ class Annotator:
         with _typed_errors(source, report), torch.inference_mode():
             result = slam.run(source, report)
             quality = assess(result, self.preset.slam, source.info.width)
+            scaled = set_scale(_scene(result), source, known, self._depth.metric, report)
+            quality = dataclasses.replace(quality, scale_sigma_ratio=scaled.sigma_ratio)
         timings = dict(result.timings_s)
         logger.info(
             "%s: %d frames, %d keyframes, reliable: %s %s",
@@ -98,20 +112,20 @@ class Annotator:
         )
         return Annotation(
             name=source.info.name,
-            world_from_cam=result.world_from_cam,
+            world_from_cam=scaled.scene.world_from_cam,
             camera=result.camera.resized(source.info.width, source.info.height),
             timestamps_s=result.timestamps_s,
             fps=source.info.fps,
             keyframes=result.keyframes,
-            scale="relative",
+            scale=scaled.scale,
             depth_kind="z",
             quality=quality,
-            provenance=self._provenance(source),
-            dense=lambda: self._dense(source, result, timings, report),
+            provenance=self._provenance(source, scaled),
+            dense=lambda: self._dense(source, result, scaled.scene, timings, report),
             timings_s=timings,
         )
 
-    def _provenance(self, source: FrameSource) -> Provenance:
+    def _provenance(self, source: FrameSource, scaled: ScaledScene) -> Provenance:
         info = source.info
         return Provenance(
             engine_version=engine_version(),
@@ -131,16 +145,22 @@ class Annotator:
                 "rotation_deg": info.rotation_deg,
                 **({"num_masks": source.num_masks} if isinstance(source, MaskedView) else {}),
             },
+            scale_source=scaled.source,
         )
 
     def _dense(
-        self, source: FrameSource, result: SlamResult, timings: dict[str, float], report: _Reporter
+        self,
+        source: FrameSource,
+        result: SlamResult,
+        scene: SceneMap,
+        timings: dict[str, float],
+        report: _Reporter,
     ) -> Generator[DenseFrame, None, None]:
         """Depth and mask of every frame in order; the time spent here, not in the consumer, is added to `timings`."""
         total = len(result.timestamps_s)
         spent_s = 0.0
         with _typed_errors(source, report):
-            stream = DenseDepth(self.preset.dense_depth).stream(source, _scene(result))
+            stream = DenseDepth(self.preset.dense_depth).stream(source, scene)
         with closing(stream) as frames:
             while True:
                 start_s = time.perf_counter()
@@ -210,6 +230,7 @@ def annotate(
     camera: str = "pinhole",
     device: str = "cpu",
     masks: str | Path | None = None,
+    scale_from: str | None = None,
     progress: ProgressCallback | None = None,
 ) -> Annotation:
     """Annotate one video; see `Annotator`, which is the better choice for several.
@@ -218,4 +239,4 @@ def annotate(
         annotation = vipe_core.annotate("clip.mp4")
         annotation.world_from_cam, annotation.camera.fov_x_deg, annotation.quality.reliable
     """
-    return Annotator(preset, camera, device).annotate(video, masks=masks, progress=progress)
+    return Annotator(preset, camera, device).annotate(video, masks=masks, scale_from=scale_from, progress=progress)

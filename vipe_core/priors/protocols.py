@@ -12,6 +12,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from vipe_core.annotation import DepthKind
 from vipe_core.ba.problem import Grid
 from vipe_core.cameras import Camera
 
@@ -173,3 +174,88 @@ class PriorFamily:
     points: PointMatcher | None
     intrinsics: IntrinsicsInit
     aligner: Aligner | None = None
+
+
+class VideoDepth(Protocol):
+    """Depth of runs of frames that is smooth over time, up to one scale and one shift of inverse depth per run.
+
+    Stateless between calls. All depth roles take pictures of any size and answer at the size they were given.
+    """
+
+    @property
+    def depth_kind(self) -> DepthKind:
+        """Of which depth the answer is the inverse."""
+
+    @property
+    def window_frames(self) -> int:
+        """Most frames of a call."""
+
+    @property
+    def overlap_frames(self) -> int:
+        """How many of them should be those that the call before ended with: fewer than half of a window, at least 2."""
+
+    def input_size(self, width: int, height: int) -> tuple[int, int]:
+        """(width, height) at which a video of that size is best given."""
+
+    def predict(self, frames: Sequence[NDArray[np.uint8]]) -> NDArray[np.float32]:
+        """(n, h, w) inverse depth of 1 to `window_frames` consecutive frames (h, w, 3): nearer is larger; NaN where the
+        model says nothing."""
+
+
+@dataclass(frozen=True, slots=True)
+class MetricEstimate:
+    """Metric depth of one picture.
+
+    Attributes:
+        depth_m: (h, w) float32; 0 where there is none, such as the sky.
+        confidence: (h, w) float32 in 0..1.
+    """
+
+    depth_m: NDArray[np.float32]
+    confidence: NDArray[np.float32]
+
+
+class MetricDepth(Protocol):
+    """Metric depth of single pictures (paper section 3.2.3). Stateless between calls."""
+
+    @property
+    def depth_kind(self) -> DepthKind:
+        """Of `MetricEstimate.depth_m`."""
+
+    @property
+    def shared_sigma_ratio(self) -> float:
+        """Standard deviation of the logarithm of the scale that all frames of a video share: 0.1 for 10 %."""
+
+    def input_size(self, width: int, height: int) -> tuple[int, int]:
+        """(width, height) at which a video of that size is best given."""
+
+    def estimate(self, rgb: NDArray[np.uint8], camera: Camera) -> MetricEstimate:
+        """Depth of a picture (h, w, 3) of a camera at its size."""
+
+
+class DepthCompletion(Protocol):
+    """Dense depth from a picture and the depth of a few of its pixels (paper section 3.3). Stateless between calls."""
+
+    def complete(self, rgb: NDArray[np.uint8], depth: NDArray[np.float32], camera: Camera) -> NDArray[np.float32]:
+        """(h, w) depth, positive everywhere, in the units and of the kind of the given one.
+
+        Args:
+            rgb: (h, w, 3).
+            depth: (h, w) along the rays of the camera; 0 where it is not known. Known for 5 pixels at least.
+            camera: At this size.
+        """
+
+
+@dataclass(frozen=True, slots=True)
+class DepthFamily:
+    """The providers of dense depth. Without any, depth is multi-view stereo and scale is relative.
+
+    Attributes:
+        video: Video depth, aligned to the map; without one, depth is multi-view stereo.
+        completion: Completes the projected map where it is sparse, before video depth is aligned to it.
+        metric: Metric scale, and what video depth is aligned to where there is no map.
+    """
+
+    video: VideoDepth | None = None
+    completion: DepthCompletion | None = None
+    metric: MetricDepth | None = None
