@@ -24,6 +24,7 @@ class TestCreate:
             shard_max_videos=3,
             shard_max_input_bytes=1000,
             name="Nächte",
+            scale_from="height=1.6",
         )
         answer = http.post("/v1/jobs", json=wanted)
         assert answer.status_code == 202
@@ -85,6 +86,8 @@ class TestCreate:
             ({"shard_max_videos": "3"}, "body.shard_max_videos"),
             ({"shard_max_input_bytes": True}, "body.shard_max_input_bytes"),
             ({"name": "x" * 201}, "body.name"),
+            ({"scale_from": "height"}, "body.scale_from"),
+            ({"scale_from": "height=-1"}, "body.scale_from"),
             ({"unknown": 1}, "body.unknown"),
         ],
     )

@@ -66,6 +66,17 @@ def test_masks_of_ones_own(vipectl: Run, clip: Path, tmp_path: Path) -> None:
     assert json.loads(done.stdout)["error"]["code"] == "mask_mismatch"
 
 
+def test_a_known_length_makes_metres(vipectl: Run, clip: Path) -> None:
+    done = vipectl("annotate", clip, "-o", "out", "--scale-from", "path=2.5", "--json")
+    assert done.returncode == 0
+    row = json.loads(done.stdout)
+    assert (row["scale"], row["scale_source"]) == ("metric", "path=2.5")
+    assert row["trajectory_length"] == pytest.approx(2.5)
+    done = vipectl("annotate", clip, "-o", "out", "--scale-from", "depth=2@9000,1,1", "--json")
+    assert json.loads(done.stdout)["error"]["code"] == "scale_unobservable"
+    assert vipectl("annotate", clip, "-o", "out", "--scale-from", "tall").returncode == 2
+
+
 def test_the_table_for_people(vipectl: Run, clip: Path, tmp_path: Path) -> None:
     shutil.copyfile(clip, tmp_path / "my clip.mp4")
     done = vipectl("annotate", "my clip.mp4", "-o", "out")

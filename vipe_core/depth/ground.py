@@ -1,7 +1,7 @@
 """The height of the camera above the ground, from the map of its keyframes.
 
-A plane at height h below a camera with unit normal n (downwards) is seen at inverse depth d = n . r / h along the ray r.
-So planes are judged in inverse depth, where the errors of the map are of one size, over some successive keyframes
+A plane at height h below a camera with unit normal n (downwards) is seen at inverse depth d = n . r / h along the ray
+r. So planes are judged in inverse depth, where the errors of the map are of one size, over some successive keyframes
 together; those votes give the height of the whole shot.
 """
 

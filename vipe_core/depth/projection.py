@@ -156,9 +156,9 @@ class MapProjector:
         for j in others:
             length, px, imaged = self._moved(rays, d[use], int(scene.keyframes[k]), int(scene.keyframes[j]))
             expected = d[use] / np.where(length > 1e-9, length, 1.0)
-            column, row = np.floor(px[:, 0]).astype(np.int64), np.floor(px[:, 1]).astype(np.int64)
-            inside = imaged & (length > 1e-9) & (column >= 0) & (row >= 0) & (column < width - 1) & (row < height - 1)
-            column, row = np.where(inside, column, 0), np.where(inside, row, 0)
+            inside = imaged & (length > 1e-9) & (px > -0.5).all(1) & (px < (width - 0.5, height - 0.5)).all(1)
+            column = np.clip(np.floor(px[:, 0]), 0, width - 2).astype(np.int64)
+            row = np.clip(np.floor(px[:, 1]), 0, height - 2).astype(np.int64)
             agrees = np.zeros(len(use), np.bool_)
             for below in (0, 1):
                 for right in (0, 1):

@@ -121,7 +121,7 @@ class Annotator:
             depth_kind="z",
             quality=quality,
             provenance=self._provenance(source, scaled),
-            dense=lambda: self._dense(source, result, scaled.scene, timings, report),
+            dense=lambda: self._dense(source, scaled.scene, timings, report),
             timings_s=timings,
         )
 
@@ -151,13 +151,12 @@ class Annotator:
     def _dense(
         self,
         source: FrameSource,
-        result: SlamResult,
         scene: SceneMap,
         timings: dict[str, float],
         report: _Reporter,
     ) -> Generator[DenseFrame, None, None]:
         """Depth and mask of every frame in order; the time spent here, not in the consumer, is added to `timings`."""
-        total = len(result.timestamps_s)
+        total = len(scene.world_from_cam)
         spent_s = 0.0
         with _typed_errors(source, report):
             stream = DenseDepth(self.preset.dense_depth).stream(source, scene)
