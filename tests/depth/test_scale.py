@@ -111,7 +111,7 @@ def test_normalised_means_median_one_over_the_confident_cells(scene: SceneMap) -
     assert len(common) > 0.99 * len(before.cell)
     unit = scene.inverse_depth[0, 5, 5] / found.inverse_depth[0, 5, 5]
     ratio = before.inverse_depth[first] / after.inverse_depth[second] / unit
-    assert np.quantile(np.abs(ratio - 1), 0.9) < 0.01
+    assert np.quantile(np.abs(ratio - 1), 0.9) < 0.03
     assert np.allclose(found.world_from_cam[0], scene.world_from_cam[0])
 
 
