@@ -15,12 +15,13 @@ import numpy as np
 import OpenEXR
 
 from services.commit import CommitOutcome, prepare_payload, write_record
-from services.domain.models import JobSpec, Lease, ShardPlan, VideoRef, VideoResult, shard_id
+from services.domain.models import Attribute, JobSpec, Lease, ShardPlan, VideoRef, VideoResult, shard_id
 from services.domain.states import VideoStatus
 from services.storage import ObjectStore
 
 WIDTH, HEIGHT = 16, 12
 JOB = "job_01test"
+ATTRIBUTES: tuple[Attribute, ...] = ("pose", "intrinsics", "depth", "rgb")  # what `write_artifacts` writes
 
 
 def depth_of(index: int) -> np.ndarray:
@@ -81,7 +82,7 @@ def make_lease(
         ordinal=ordinal,
         plan_hash=plan.plan_hash,
         videos=plan.videos,
-        spec=JobSpec(inputs=("/in",), output=output),
+        spec=JobSpec(inputs=("/in",), output=output, attributes=ATTRIBUTES),
         attempt=attempt,
         fence=attempt if fence is None else fence,
         holder=f"agent-{attempt}",

@@ -146,6 +146,8 @@ MEASURED, FILLED, SKY, MOVING, UNOBSERVED = range(5)
 """Where the depth of a pixel comes from: several views agree on it; it is filled in from what is around it; it is sky,
 at the far end; it moves by itself, and is filled in from what it touches; nothing is known around it."""
 
+DEPTH_KINDS = {MEASURED: "measured", FILLED: "filled", SKY: "sky", MOVING: "moving", UNOBSERVED: "unobserved"}
+
 
 @dataclass(frozen=True, slots=True)
 class DenseFrame:

@@ -15,6 +15,7 @@
     │   └── DecodeCrashed         decode_crashed      (retryable)
     ├── ConfigError           invalid_config          a preset, camera or device that does not exist
     ├── FormatError           format_error            an artifact on disk does not hold what it must
+    │   └── ExportUnsupported     export_unsupported  a format cannot hold this sequence
     └── EngineError           engine_failed           a stage could not finish; always a defect of ours
 
 Codes are part of the public interface: they are stored in databases and
@@ -118,6 +119,12 @@ class ConfigError(VipeError):
 
 class FormatError(VipeError):
     code = "format_error"
+
+
+class ExportUnsupported(FormatError):
+    """The format that was asked for cannot say what the sequence holds, such as its camera model."""
+
+    code = "export_unsupported"
 
 
 class EngineError(VipeError):

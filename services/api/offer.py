@@ -7,7 +7,7 @@ from functools import cache
 from typing import Literal, get_args
 
 # What the engine writes for every video.
-OfferedAttribute = Literal["pose", "intrinsics", "depth", "rgb", "mask"]
+OfferedAttribute = Literal["pose", "intrinsics", "depth", "rgb", "mask", "confidence"]
 ATTRIBUTES: tuple[OfferedAttribute, ...] = get_args(OfferedAttribute)
 
 _BUCKET = re.compile(r"[a-z0-9][a-z0-9.-]{1,61}[a-z0-9]")

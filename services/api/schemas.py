@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal, Self
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
 
 from services.api import offer
-from services.domain.models import Event, Job, JobSpec, Shard
+from services.domain.models import DEFAULT_ATTRIBUTES, Event, Job, JobSpec, Shard
 from services.domain.states import JobState, ShardState, VideoStatus
 from services.store.base import VideoRow
 
@@ -37,9 +37,9 @@ class JobRequest(BaseModel):
         default="pinhole", max_length=64, description="Camera model."
     )
     attributes: list[offer.OfferedAttribute] = Field(
-        default_factory=lambda: list(offer.ATTRIBUTES),
+        default_factory=lambda: list(DEFAULT_ATTRIBUTES),
         max_length=8,
-        description="Tars to write; `pose` and `intrinsics` always are.",
+        description="Tars to write; `pose` and `intrinsics` always are, `confidence` only when it is asked for.",
     )
     shard_max_videos: int = Field(default=16, ge=1, le=1000, description="Most videos in one shard.")
     shard_max_input_bytes: int = Field(

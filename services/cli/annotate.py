@@ -18,7 +18,10 @@ if TYPE_CHECKING:
 def annotate(
     inputs: Annotated[list[Path], typer.Argument(metavar="INPUT...", help="Video files, or directories of images.")],
     output: Annotated[
-        Path, typer.Option("-o", "--output", metavar="OUT", help="Gets pose/, intrinsics/, depth/, rgb/, mask/.")
+        Path,
+        typer.Option(
+            "-o", "--output", metavar="OUT", help="Gets pose/, intrinsics/, depth/, rgb/, mask/, confidence/."
+        ),
     ],
     preset: Annotated[str, typer.Option(help="Which components do the work.")] = "classical",
     camera: Annotated[str, typer.Option(help="Camera model.")] = "pinhole",

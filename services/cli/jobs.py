@@ -43,6 +43,10 @@ def submit(
         str | None,
         typer.Option(metavar="KNOWN", help="A known length of every video, as `vipectl annotate --scale-from`."),
     ] = None,
+    attributes: Annotated[
+        str | None,
+        typer.Option(metavar="A,B,...", help="Tars to write: depth,rgb,mask,confidence; the last only if named."),
+    ] = None,
     key: Annotated[
         str | None, typer.Option("--idempotency-key", help="The same key and job is never run twice.")
     ] = None,
@@ -53,7 +57,7 @@ def submit(
 ) -> None:
     """Submit a job to a running service."""
     client = _client(api, api_key)
-    spec = {
+    spec: dict[str, Any] = {
         "inputs": [absolute(item) for item in inputs],
         "output": absolute(output).rstrip("/"),
         "preset": preset,
@@ -62,6 +66,8 @@ def submit(
     }
     if scale_from is not None:
         spec["scale_from"] = scale_from
+    if attributes is not None:
+        spec["attributes"] = [name.strip() for name in attributes.split(",") if name.strip()]
     job = client.submit(spec, idempotency_key=key)
     if as_json:
         _print_json(job)

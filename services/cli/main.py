@@ -9,7 +9,7 @@ from typing import Annotated, ParamSpec, TypeVar
 
 import typer
 
-from services.cli import annotate, data, demo, evaluate, jobs, serve
+from services.cli import annotate, data, demo, evaluate, export, jobs, serve
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -76,7 +76,7 @@ _COMMANDS: dict[str, Callable[..., None]] = {
     "cancel": jobs.cancel,
     "verify": data.verify,
     "unpack": data.unpack,
-    "export": data.export,
+    "export": export.export,
 }
 for _name, _command in _COMMANDS.items():
     app.command(_name)(_typed_errors(_command))

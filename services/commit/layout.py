@@ -1,6 +1,6 @@
 """Where things lie in an output, and how the engine's artifacts become members of webdataset tars.
 
-payload/<prefix>-<8 hex>/{pose,intrinsics,depth,rgb,mask}.tar   what NVIDIA published its data sets in
+payload/<prefix>-<8 hex>/{pose,intrinsics,depth,rgb,mask,confidence}.tar   what NVIDIA published its data sets in
 _commits/<job id>/<shard id>.json                               the create-once records; readers trust nothing else
 _claims/<prefix>-<8 hex>.json                                   who took a tar name
 meta.parquet, failures.parquet, dataset.json, README.md         written once every shard has its record
@@ -51,6 +51,7 @@ MEMBERS: dict[Attribute, tuple[Member, ...]] = {
     "depth": (Member("zip", "depth/{key}.zip"),),
     "rgb": (Member("mp4", "rgb/{key}.mp4"),),
     "mask": (Member("txt", "mask/{key}.txt"), Member("zip", "mask/{key}.zip")),
+    "confidence": (Member("kind.zip", "confidence/{key}_kind.zip"), Member("zip", "confidence/{key}.zip")),
 }
 
 

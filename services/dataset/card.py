@@ -7,6 +7,7 @@ from typing import Any
 
 from services.commit.layout import attributes_of
 from services.domain.models import JobSpec
+from vipe_core.annotation import DEPTH_KINDS
 
 _SIZES = ((1_000, "n<1K"), (10_000, "1K<n<10K"), (100_000, "10K<n<100K"), (1_000_000, "100K<n<1M"))
 
@@ -18,6 +19,8 @@ _CONTENT = {
     "depth": "`S.zip`: `%05d.exr` per frame, one half channel `Z`, 0 = no value",
     "rgb": "`S.mp4`: the frames that the annotation belongs to, H.264",
     "mask": "`S.zip`: `%05d.png` instance ids per frame, 0 = background; `S.txt`: id and phrase",
+    "confidence": "`S.zip`: `%05d.png` per frame, confidence of the depth in steps of 1/255, 0 = filled in; "
+    "`S.kind.zip`: `%05d.png`, where it comes from: " + ", ".join(f"{n} {word}" for n, word in DEPTH_KINDS.items()),
 }
 
 _CARD = """---

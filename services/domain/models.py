@@ -11,7 +11,8 @@ from typing import Any, Literal
 
 from services.domain.states import JobState, ShardState, VideoStatus
 
-Attribute = Literal["pose", "intrinsics", "depth", "rgb", "mask"]
+Attribute = Literal["pose", "intrinsics", "depth", "rgb", "mask", "confidence"]
+DEFAULT_ATTRIBUTES: tuple[Attribute, ...] = ("pose", "intrinsics", "depth", "rgb", "mask")
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,7 +36,7 @@ class JobSpec:
     output: str
     preset: str = "classical"
     camera: str = "pinhole"
-    attributes: tuple[Attribute, ...] = ("pose", "intrinsics", "depth", "rgb")
+    attributes: tuple[Attribute, ...] = DEFAULT_ATTRIBUTES
     shard_max_videos: int = 16
     shard_max_input_bytes: int = 1 << 30
     name: str = ""

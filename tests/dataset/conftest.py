@@ -9,7 +9,7 @@ from pathlib import Path
 
 import boto3
 import pytest
-from shard_factory import JOB, commit_shard, failure, make_lease, success, write_artifacts
+from shard_factory import ATTRIBUTES, JOB, commit_shard, failure, make_lease, success, write_artifacts
 
 from services.dataset import finalise
 from services.domain.models import JobSpec
@@ -17,7 +17,7 @@ from services.storage import DirectoryStore, ObjectStore, S3Store
 
 FRAMES = {"cat-1": 3, "ant-2": 2, "dog-3": 4}
 SHARDS = [["cat-1", "bad-1", "ant-2"], ["bad-2", "poison-3"], ["dog-3"]]
-SPEC = JobSpec(inputs=("/in",), output="/out", name='Three "animals"')
+SPEC = JobSpec(inputs=("/in",), output="/out", attributes=ATTRIBUTES, name='Three "animals"')
 
 
 @pytest.fixture(scope="session")

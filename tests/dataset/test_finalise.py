@@ -10,7 +10,7 @@ from pathlib import Path
 import pyarrow.parquet as pq
 import pytest
 import yaml
-from shard_factory import JOB, commit_shard, make_lease, success
+from shard_factory import ATTRIBUTES, JOB, commit_shard, make_lease, success
 
 from services.commit import committed_records
 from services.dataset import finalise
@@ -19,7 +19,7 @@ from services.domain.errors import IntegrityError
 from services.domain.models import JobSpec
 from services.storage import DirectoryStore, ObjectStore
 
-SPEC = JobSpec(inputs=("/in",), output="/out", name='Three "animals"')
+SPEC = JobSpec(inputs=("/in",), output="/out", attributes=ATTRIBUTES, name='Three "animals"')
 
 
 def _table(store: ObjectStore, key: str):

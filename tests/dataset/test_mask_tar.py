@@ -14,7 +14,7 @@ from services.dataset import finalise, unpack, verify
 from services.domain.models import JobSpec
 from services.storage import DirectoryStore
 from vipe_core.formats import export_npz, read_artifacts
-from vipe_core.formats.mask_zip import MaskZipWriter
+from vipe_core.formats.png_zip import MaskZipWriter
 
 FRAMES = {"cat-1": 3, "ant-2": 2}
 SPEC = JobSpec(inputs=("/in",), output="/out", attributes=("pose", "intrinsics", "depth", "rgb", "mask"))

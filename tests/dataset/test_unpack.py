@@ -9,7 +9,7 @@ from pathlib import Path
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from shard_factory import JOB, commit_shard, make_lease, success, write_artifacts
+from shard_factory import ATTRIBUTES, JOB, commit_shard, make_lease, success, write_artifacts
 
 from services.dataset import finalise, unpack
 from services.domain.errors import IntegrityError, ObjectMissing
@@ -57,7 +57,7 @@ def test_stems_are_used_where_they_are_free(tmp_path: Path) -> None:
         write_artifacts(tmp_path / "a", key)
         results.append(VideoResult(**{**_fields(success(key)), "uri": uri}))
     commit_shard(make_lease(list(uris)), results, tmp_path / "a", tmp_path / "s", store, lambda: True)
-    finalise(store, JOB, JobSpec(inputs=("/in",), output="/out"), num_shards=1)
+    finalise(store, JOB, JobSpec(inputs=("/in",), output="/out", attributes=ATTRIBUTES), num_shards=1)
     result = unpack(store, tmp_path / "u", names="stem")
     assert result.names == {"clip-1": "My-Clip", "x-2": "x-2", "x-3": "x-3"}
     assert (tmp_path / "u" / "intrinsics" / "My-Clip_camera.txt").is_file()

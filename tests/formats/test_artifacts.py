@@ -46,6 +46,8 @@ def test_files_hold_what_vipe_writes(tmp_path: Path, model: str, disk_name: str,
         "rgb/clip.mp4",
         "mask/clip.zip",
         "mask/clip.txt",
+        "confidence/clip.zip",
+        "confidence/clip_kind.zip",
         "vipe/clip_info.json",
     }
     with np.load(tmp_path / "pose/clip.npz", allow_pickle=False) as pose:
@@ -271,6 +273,7 @@ def test_sample_members_and_their_inverse(tmp_path: Path) -> None:
         "depth": ["zip"],
         "mask": ["zip", "txt"],
         "rgb": ["mp4"],
+        "confidence": ["zip", "kind.zip"],
     }
     for attribute, files in members.items():
         for suffix, path in files.items():

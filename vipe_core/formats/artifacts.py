@@ -1,4 +1,5 @@
-"""Writing an annotation as ViPE artifacts: `pose`, `intrinsics`, `depth`, `rgb`, `mask`, and `vipe/NAME_info.json`.
+"""Writing an annotation as ViPE artifacts: `pose`, `intrinsics`, `depth`, `rgb`, `mask`, our own `confidence`, and
+`vipe/NAME_info.json`.
 
 Payload bytes depend on the annotation only (never on time, order of hashing or this machine's paths), and nothing
 appears under its final name before all of it is complete. Upstream keeps its description in a pickle; ours is JSON.
@@ -19,21 +20,30 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from vipe_core.annotation import MASK_PHRASES, Annotation, DenseFrame, DepthKind
+from vipe_core.annotation import DEPTH_KINDS, MASK_PHRASES, Annotation, DenseFrame, DepthKind
 from vipe_core.cameras import Camera, CameraModel
 from vipe_core.errors import EngineError
 from vipe_core.formats.depth_zip import DepthZipWriter
+from vipe_core.formats.frame_zip import FrameZipWriter
 from vipe_core.formats.layout import artifact_files, artifact_path, info_path
-from vipe_core.formats.mask_zip import MaskZipWriter
+from vipe_core.formats.png_zip import ConfidenceZipWriter, KindZipWriter, MaskZipWriter
 from vipe_core.video.encode import VideoWriter
 from vipe_core.video.naming import sanitise_name
 
-Attribute = Literal["pose", "intrinsics", "depth", "rgb", "mask"]
-ALL_ATTRIBUTES: tuple[Attribute, ...] = ("pose", "intrinsics", "depth", "rgb", "mask")
+Attribute = Literal["pose", "intrinsics", "depth", "rgb", "mask", "confidence"]
+ALL_ATTRIBUTES: tuple[Attribute, ...] = ("pose", "intrinsics", "depth", "rgb", "mask", "confidence")
 
 INFO_SCHEMA = 1
 # What a depth value means on disk is fixed by the camera: along the axis, except for panoramas.
 DISK_DEPTH_KINDS: dict[CameraModel, DepthKind] = {"pinhole": "z", "mei": "z", "equirect": "ray"}
+# Key, attribute and member of everything that is written frame by frame.
+_DENSE = (
+    ("depth", "depth", "zip"),
+    ("rgb", "rgb", "mp4"),
+    ("mask", "mask", "zip"),
+    ("confidence", "confidence", "zip"),
+    ("kind", "confidence", "kind.zip"),
+)
 DISK_CAMERA_NAMES = {"pinhole": "PINHOLE", "mei": "MEI", "equirect": "PANORAMA"}
 
 
@@ -51,10 +61,15 @@ class ArtifactPaths:
     rgb: Path | None
     mask: Path | None
     mask_txt: Path | None
+    confidence: Path | None
+    kind: Path | None
 
     @property
     def files(self) -> tuple[Path, ...]:
-        optional = (self.pose, self.intrinsics, self.camera_txt, self.depth, self.rgb, self.mask, self.mask_txt)
+        optional = (
+            *(self.pose, self.intrinsics, self.camera_txt, self.depth, self.rgb),
+            *(self.mask, self.mask_txt, self.confidence, self.kind),
+        )
         return (*(path for path in optional if path is not None), self.info)
 
 
@@ -65,7 +80,7 @@ def write_artifacts(
     attributes: Sequence[Attribute] = ALL_ATTRIBUTES,
     progress: Callable[[int, int], None] | None = None,
 ) -> ArtifactPaths:
-    """Write `annotation` below `root`, consuming its dense stream once (not at all without `depth`, `rgb` and `mask`).
+    """Write `annotation` below `root`, consuming its dense stream once (not at all for poses and intrinsics).
 
     An earlier result of the same name is replaced: first its `_info.json` goes, then its files, then the new
     `_info.json` appears, so that its presence always means a complete sequence with nothing of an earlier one. Depth is
@@ -115,6 +130,8 @@ def write_artifacts(
         rgb=moved.get("rgb"),
         mask=moved.get("mask"),
         mask_txt=moved.get("mask_txt"),
+        confidence=moved.get("confidence"),
+        kind=moved.get("kind"),
     )
 
 
@@ -162,42 +179,49 @@ def _write_all(
         kind = DISK_CAMERA_NAMES[annotation.camera.model]
         path = new("camera_txt", artifact_path(work, name, "intrinsics", "camera.txt"))
         path.write_text("".join(f"{index}: {kind}\n" for index in range(count)), encoding="ascii")
-    mask: Path | None = None
     if "mask" in attributes:
-        mask = new("mask", artifact_path(work, name, "mask", "zip"))
         path = new("mask_txt", artifact_path(work, name, "mask", "txt"))
         path.write_text("".join(f"{number}: {phrase}\n" for number, phrase in MASK_PHRASES.items()), encoding="ascii")
-    if {"depth", "rgb", "mask"} & set(attributes):
-        depth = new("depth", artifact_path(work, name, "depth", "zip")) if "depth" in attributes else None
-        rgb = new("rgb", artifact_path(work, name, "rgb", "mp4")) if "rgb" in attributes else None
-        _write_dense(annotation, depth, rgb, mask, progress)
+    dense = {
+        key: new(key, artifact_path(work, name, attribute, suffix))
+        for key, attribute, suffix in _DENSE
+        if attribute in attributes
+    }
+    if dense:
+        _write_dense(annotation, dense, progress)
     new("info", info_path(work, name)).write_text(_info_json(annotation, attributes), encoding="utf-8")
     return written
 
 
-def _write_dense(
-    annotation: Annotation,
-    depth_path: Path | None,
-    rgb_path: Path | None,
-    mask_path: Path | None,
-    progress: Callable[[int, int], None] | None,
-) -> None:
+def _write_dense(annotation: Annotation, paths: dict[str, Path], progress: Callable[[int, int], None] | None) -> None:
+    """Write the parts of the dense stream that have a path, by the keys of `_DENSE`."""
     total = annotation.num_frames
     done = 0
     factor = disk_depth_factor(annotation.camera, annotation.depth_kind)
+    writers: dict[str, Callable[[Path], FrameZipWriter]] = {
+        "depth": DepthZipWriter,
+        "mask": MaskZipWriter,
+        "confidence": ConfidenceZipWriter,
+        "kind": KindZipWriter,
+    }
     with ExitStack() as stack:
-        depth = stack.enter_context(DepthZipWriter(depth_path)) if depth_path else None
-        rgb = stack.enter_context(VideoWriter(rgb_path, annotation.fps)) if rgb_path else None
-        mask = stack.enter_context(MaskZipWriter(mask_path)) if mask_path else None
+        rgb = stack.enter_context(VideoWriter(paths["rgb"], annotation.fps)) if "rgb" in paths else None
+        zips = {key: stack.enter_context(opened(paths[key])) for key, opened in writers.items() if key in paths}
         # Closed here, not when an exception's traceback lets go of it: decoder processes are behind it.
         for frame in stack.enter_context(closing(annotation.dense())):
             _check_dense(annotation, frame, done)
-            if depth is not None:
-                depth.append(frame.depth if factor is None else frame.depth * factor)
             if rgb is not None:
                 rgb.write(frame.rgb)
-            if mask is not None:
-                mask.append(frame.mask)
+            maps: dict[str, NDArray[Any]] = {
+                "mask": frame.mask,
+                "confidence": frame.confidence,
+                "kind": frame.kind,
+                "depth": frame.depth,
+            }
+            if factor is not None:
+                maps["depth"] = frame.depth * factor
+            for key, archive in zips.items():
+                archive.append(maps[key])
             done += 1
             if progress is not None:
                 progress(done, total)
@@ -210,7 +234,8 @@ def _check_dense(annotation: Annotation, frame: DenseFrame, expected_index: int)
     if frame.index != expected_index or frame.index >= annotation.num_frames:
         raise EngineError(f"{annotation.name}: the dense stream gave frame {frame.index} as number {expected_index}")
     size = (camera.height, camera.width)
-    if frame.depth.shape != size or frame.mask.shape != size or frame.rgb.shape != (*size, 3):
+    maps = (frame.depth, frame.mask, frame.confidence, frame.kind)
+    if any(values.shape != size for values in maps) or frame.rgb.shape != (*size, 3):
         raise EngineError(
             f"{annotation.name}: frame {frame.index} is not of the camera's size {camera.width}x{camera.height}"
         )
@@ -229,6 +254,7 @@ def _info_json(annotation: Annotation, attributes: Sequence[Attribute]) -> str:
         "fps": annotation.fps,
         "scale": annotation.scale,
         "depth_kind": DISK_DEPTH_KINDS[camera.model],
+        "depth_kinds": {str(number): phrase for number, phrase in DEPTH_KINDS.items()},
         "trajectory_length": annotation.trajectory_length,
         "quality": annotation.quality.summary(),
         **annotation.quality.per_frame(),

@@ -1,7 +1,7 @@
 """Where ViPE's directory layout keeps the parts of a sequence, and how they are named inside of tars.
 
 On disk the camera models lie in `intrinsics/S_camera.txt`; in a tar that member is `S.camera.txt`, because a webdataset
-key ends at the first dot and must be S for all members of a sample.
+key ends at the first dot and must be S for all members of a sample. The same holds for `confidence/S_kind.zip`.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ _MEMBERS: dict[str, dict[str, str]] = {
     "depth": {"zip": "depth/{}.zip"},
     "mask": {"zip": "mask/{}.zip", "txt": "mask/{}.txt"},
     "rgb": {"mp4": "rgb/{}.mp4"},
+    "confidence": {"zip": "confidence/{}.zip", "kind.zip": "confidence/{}_kind.zip"},
 }
 ATTRIBUTES = tuple(_MEMBERS)
 

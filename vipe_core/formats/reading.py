@@ -7,7 +7,7 @@ import zipfile
 import zlib
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,9 +17,12 @@ from vipe_core.cameras import Camera, CameraModel
 from vipe_core.errors import ConfigError, FormatError, VipeError
 from vipe_core.formats.artifacts import DISK_DEPTH_KINDS
 from vipe_core.formats.depth_zip import DepthZipReader
+from vipe_core.formats.frame_zip import FrameZipReader
 from vipe_core.formats.layout import artifact_path, info_path
-from vipe_core.formats.mask_zip import MaskZipReader
+from vipe_core.formats.png_zip import ConfidenceZipReader, KindZipReader, MaskZipReader
 from vipe_core.video.probe import probe
+
+Reader = TypeVar("Reader", bound=FrameZipReader[Any])
 
 _MODELS: dict[str, tuple[CameraModel, int]] = {
     "PINHOLE": ("pinhole", 4),
@@ -58,39 +61,49 @@ class Artifacts:
 
     @property
     def has_depth(self) -> bool:
-        return artifact_path(self.root, self.name, "depth", "zip").is_file()
+        return self._path("depth", "zip").is_file()
 
     @property
     def has_mask(self) -> bool:
-        return artifact_path(self.root, self.name, "mask", "zip").is_file()
+        return self._path("mask", "zip").is_file()
+
+    @property
+    def has_confidence(self) -> bool:
+        """Confidence and kind of each depth value; directories of the original tool have none."""
+        return self._path("confidence", "zip").is_file() and self._path("confidence", "kind.zip").is_file()
 
     @property
     def rgb_path(self) -> Path | None:
-        path = artifact_path(self.root, self.name, "rgb", "mp4")
+        path = self._path("rgb", "mp4")
         return path if path.is_file() else None
 
     def open_depth(self) -> DepthZipReader:
         """Depth maps, one per pose; close it after use.
 
         Raises:
-            FormatError: No depth, a damaged archive, or another number of maps than poses.
+            FormatError: No depth, a damaged archive, or another number of maps than poses. So do the others.
         """
-        reader = DepthZipReader(artifact_path(self.root, self.name, "depth", "zip"))
-        if len(reader) != self.num_frames:
-            reader.close()
-            raise FormatError(f"{self.name}: {len(reader)} depth maps for {self.num_frames} poses")
-        return reader
+        return self._checked(DepthZipReader(self._path("depth", "zip")))
 
     def open_mask(self) -> MaskZipReader:
-        """Masks of instance ids, one per pose; close it after use.
+        """Masks of instance ids, one per pose; close it after use."""
+        return self._checked(MaskZipReader(self._path("mask", "zip")))
 
-        Raises:
-            FormatError: No masks, a damaged archive, or another number of masks than poses.
-        """
-        reader = MaskZipReader(artifact_path(self.root, self.name, "mask", "zip"))
+    def open_confidence(self) -> ConfidenceZipReader:
+        """Confidence in 0..1, one map per pose; close it after use."""
+        return self._checked(ConfidenceZipReader(self._path("confidence", "zip")))
+
+    def open_kind(self) -> KindZipReader:
+        """Classes of `annotation.DEPTH_KINDS`, one map per pose; close it after use."""
+        return self._checked(KindZipReader(self._path("confidence", "kind.zip")))
+
+    def _path(self, attribute: str, suffix: str) -> Path:
+        return artifact_path(self.root, self.name, attribute, suffix)
+
+    def _checked(self, reader: Reader) -> Reader:
         if len(reader) != self.num_frames:
             reader.close()
-            raise FormatError(f"{self.name}: {len(reader)} masks for {self.num_frames} poses")
+            raise FormatError(f"{self.name}: {len(reader)} {reader.kind}s for {self.num_frames} poses")
         return reader
 
 

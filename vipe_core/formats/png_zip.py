@@ -1,0 +1,77 @@
+"""A clip's 8-bit pictures in one zip of PNG: instance masks, confidence, and where each depth value comes from."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from vipe_core.errors import FormatError
+from vipe_core.formats.frame_zip import FrameZipReader, FrameZipWriter
+
+_PNG_LEVEL = 3
+
+
+class MaskZipWriter(FrameZipWriter):
+    """Appends (H, W) uint8 masks."""
+
+    suffix = "png"
+
+    def _encoded(self, picture: NDArray[Any]) -> bytes:
+        return _png(picture)
+
+
+class MaskZipReader(FrameZipReader[np.uint8]):
+    """Reads (H, W) uint8 instance ids; 0 is background."""
+
+    suffix = "png"
+    kind = "mask"
+    max_bytes = 1 << 28
+
+    def _decoded(self, data: bytes, label: str) -> NDArray[np.uint8]:
+        return _picture(data, label)
+
+
+class KindZipWriter(MaskZipWriter):
+    """Appends (H, W) uint8 classes of `annotation.DEPTH_KINDS`."""
+
+
+class KindZipReader(MaskZipReader):
+    """Reads (H, W) uint8 classes of `annotation.DEPTH_KINDS`."""
+
+    kind = "map of depth kinds"
+
+
+class ConfidenceZipWriter(FrameZipWriter):
+    """Appends (H, W) confidence in 0..1, in steps of 1/255; what is not 0 stays above 0."""
+
+    suffix = "png"
+
+    def _encoded(self, picture: NDArray[Any]) -> bytes:
+        steps = np.clip(np.rint(picture * np.float32(255)), 0, 255)
+        return _png(np.where(picture > 0, np.maximum(steps, 1), 0).astype(np.uint8))
+
+
+class ConfidenceZipReader(FrameZipReader[np.float32]):
+    """Reads (H, W) float32 confidence in 0..1; 0 is a value that was filled in."""
+
+    suffix = "png"
+    kind = "confidence map"
+    max_bytes = 1 << 28
+
+    def _decoded(self, data: bytes, label: str) -> NDArray[np.float32]:
+        return _picture(data, label) * np.float32(1 / 255)
+
+
+def _png(picture: NDArray[Any]) -> bytes:
+    _, data = cv2.imencode(".png", picture, [cv2.IMWRITE_PNG_COMPRESSION, _PNG_LEVEL])
+    return data.tobytes()
+
+
+def _picture(data: bytes, label: str) -> NDArray[np.uint8]:
+    picture = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), cv2.IMREAD_UNCHANGED) if data else None
+    if picture is None or picture.dtype != np.uint8 or picture.ndim != 2:
+        raise FormatError(f"{label}: not an 8-bit picture of one channel")
+    return np.asarray(picture, dtype=np.uint8)

@@ -1,0 +1,72 @@
+"""What fusion takes from one frame, and which of its pixels may be fused."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vipe_core.annotation import DepthKind
+from vipe_core.cameras import Camera
+
+Array = NDArray[Any]
+
+
+@dataclass(frozen=True, slots=True)
+class SurfaceView:
+    """One frame.
+
+    Attributes:
+        world_from_cam: (4, 4) float64, OpenCV axes.
+        rgb: (H, W, 3) uint8.
+        depth: (H, W) float32; 0 is no value.
+        weight: (H, W) float32, how much a pixel counts; 0 keeps it out.
+    """
+
+    world_from_cam: NDArray[np.float64]
+    rgb: NDArray[np.uint8]
+    depth: NDArray[np.float32]
+    weight: NDArray[np.float32]
+
+
+def surface_weight(
+    depth: Array,
+    *,
+    confidence: Array | None = None,
+    mask: Array | None = None,
+    min_confidence: float = 0.0,
+) -> NDArray[np.float32]:
+    """(H, W) float32 weight of each pixel: its confidence, or 1 where there is none, and 0 where it must stay out.
+
+    What moves by itself stays out, because it is not where another frame saw it. So does a value that nobody measured
+    (confidence 0).
+
+    Args:
+        depth: (H, W); not finite or not positive is no value.
+        confidence: (H, W) in 0..1.
+        mask: (H, W) ids of what moves by itself; 0 is the static background.
+        min_confidence: Below it a pixel stays out.
+    """
+    usable = np.isfinite(depth) & (depth > 0)
+    if mask is not None:
+        usable &= mask == 0
+    if confidence is None:
+        return usable.astype(np.float32)
+    usable &= (confidence > 0) & (confidence >= min_confidence)
+    return np.where(usable, confidence, 0).astype(np.float32)
+
+
+def points_per_depth(camera: Camera, kind: DepthKind) -> NDArray[np.float32]:
+    """(H, W, 3) float32: depth of `kind` times this is the point in the camera frame; 0 where there is no such depth.
+
+    A pixel at or beyond 90 degrees has no depth along the axis.
+    """
+    rays = camera.rays()
+    if kind == "ray":
+        rays = rays / np.linalg.norm(rays, axis=-1, keepdims=True)
+    else:
+        ahead = rays[..., 2:] > 1e-6
+        rays = np.where(ahead, rays / np.where(ahead, rays[..., 2:], 1), 0)
+    return np.ascontiguousarray(rays, np.float32)

@@ -1,0 +1,1 @@
+"""Pictures and videos of results, drawn in software: no display, no OpenGL."""
