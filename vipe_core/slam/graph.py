@@ -44,9 +44,10 @@ def sharpen(measured: Match, aligned: Match) -> Match:
     An alignment started from the geometry and flow that did not: where the two disagree by more than `_AGREE_PX`,
     something moves or is hidden, and flow stays to say so.
     """
-    apart = np.linalg.norm(aligned.target_px - measured.target_px, axis=1) > _AGREE_PX
-    apart &= measured.weight.any(axis=1)
-    better = ~apart & (aligned.weight.max(axis=1) > measured.weight.max(axis=1))
+    before, after = (np.maximum(match.weight[:, 0], match.weight[:, 1]) for match in (measured, aligned))
+    away = np.square(aligned.target_px - measured.target_px)
+    agrees = (away[:, 0] + away[:, 1] <= _AGREE_PX**2) | (before == 0)
+    better = agrees & (after > before)
     return Match(
         np.where(better[:, None], aligned.target_px, measured.target_px),
         np.where(better[:, None], aligned.weight, measured.weight),

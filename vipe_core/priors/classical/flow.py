@@ -22,6 +22,8 @@ from vipe_core.priors.classical.features import (
     dense_from_cells,
     fill_cells,
     grid_of,
+    larger,
+    length_px,
     sample_px,
 )
 from vipe_core.priors.protocols import Match, WorkingFrame
@@ -73,16 +75,24 @@ def _motion_only() -> Any:
     return flow
 
 
+def _unsmoothed() -> Any:
+    """Patches at half the picture's size, like the medium preset, but sparser and without its variational refinement:
+    where there is structure its error is the same, at a third of the price."""
+    flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST)
+    flow.setFinestScale(1)
+    return flow
+
+
 class DisFlowMatcher:
     """`DenseMatcher` without a network. One instance per thread: OpenCV's flow object owns its buffers.
 
     Args:
-        fine: `match` resolves flow to half the picture's size, at four times the price of a quarter: for those who use
-            it as it is. In the map, tracks and patches are finer than either.
+        fine: `match` refines flow variationally, at three times the price: for those who use it as it is. In the map,
+            tracks and patches refine it.
     """
 
     def __init__(self, *, fine: bool = False) -> None:
-        self._both_ways = _preset(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM if fine else cv2.DISOPTICAL_FLOW_PRESET_FAST)
+        self._both_ways = _preset(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM) if fine else _Flow(_unsmoothed)
         self._fast = _preset(cv2.DISOPTICAL_FLOW_PRESET_FAST)
         self._ultrafast = _preset(cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST)
         self._half = _Flow(_motion_only)
@@ -95,7 +105,7 @@ class DisFlowMatcher:
     def is_blank(self, features: FlowFeatures) -> bool:
         """Whether the picture holds nothing to match: black, white, or noise of a grey level or so."""
         usable = features.usable_cells
-        strength = features.structure.max(axis=1)[usable]
+        strength = features.strength[usable]
         return not len(strength) or float((strength >= _BLANK_STRUCTURE).mean()) < _BLANK_SHARE
 
     def motion_px(self, source: FlowFeatures, target: FlowFeatures) -> float:
@@ -105,7 +115,7 @@ class DisFlowMatcher:
             return 0.0
         flow = self._half.calc(source.half, target.half)
         points = (cell_centres_px(source.grid) - 0.5) / 2
-        return 2 * float(np.median(np.linalg.norm(sample_px(flow, points[cells]), axis=1)))
+        return 2 * float(np.median(length_px(sample_px(flow, points[cells]))))
 
     def match(self, source: FlowFeatures, target: FlowFeatures, guess_px: Array | None = None) -> tuple[Match, Match]:
         """Measurements source -> target and target -> source; see `DenseMatcher.match`."""
@@ -130,7 +140,7 @@ class DisFlowMatcher:
         if init is None:
             return dis.calc(source, target)
         height, width = source.shape
-        reach = float(np.median(np.linalg.norm(cell_mean(init), axis=-1)))
+        reach = float(np.median(length_px(cell_mean(init))))
         if reach <= _WIDE_MOTION_RATIO * float(np.hypot(height, width)):
             return dis.calc(source, target, np.array(init, np.float32, order="C"))
         # Far from zero, DIS may drop the guess at its coarsest scale. Warp the target by the guess, measure the small
@@ -150,7 +160,7 @@ def _guessed_cells(source: FlowFeatures, guess_px: Array | None) -> NDArray[np.f
     displacement = np.asarray(guess_px, np.float64) - cell_centres_px(source.grid)
     # Points that the current geometry puts behind the camera come in as anything at all.
     with np.errstate(invalid="ignore"):
-        known = np.isfinite(displacement).all(axis=1) & (np.abs(displacement).max(axis=1) < width + height)
+        known = larger(np.abs(displacement)) < width + height
     if not known.any():
         return None
     return fill_cells(np.where(known[:, None], displacement, 0), known, source.grid)
@@ -170,7 +180,7 @@ def _dense_inverse(cells: Array | None, source: FlowFeatures) -> NDArray[np.floa
 def _inverse_cells(displacement: Array, grid: Grid) -> NDArray[np.float32]:
     """(P, 2) displacement target -> source at the target's cells, from source -> target at the source's cells."""
     landing = np.rint((displacement + cell_centres_px(grid) - grid.offset) / grid.stride).astype(np.int64)
-    inside = ((landing >= 0) & (landing < (grid.width, grid.height))).all(axis=1)
+    inside = _inside(landing, grid.width, grid.height)
     index = landing[inside, 1] * grid.width + landing[inside, 0]
     count = np.bincount(index, minlength=grid.num_cells)
     mean = np.stack(
@@ -181,23 +191,29 @@ def _inverse_cells(displacement: Array, grid: Grid) -> NDArray[np.float32]:
     return -fill_cells(mean, count > 0, grid)
 
 
+def _inside(points: Array, width: int, height: int) -> NDArray[np.bool_]:
+    """(P,) which of (P, 2) index coordinates lie on a picture."""
+    x, y = points[:, 0], points[:, 1]
+    return np.asarray((x >= 0) & (x <= width - 1) & (y >= 0) & (y <= height - 1))
+
+
 def _measure(source: FlowFeatures, target: FlowFeatures, forward: Array, backward: Array) -> Match:
     """Samples a flow at the source's cells and weighs it by consistency with the reverse flow and by structure."""
     height, width = target.gray.shape
     displacement = cell_mean(forward).reshape(-1, 2)
     target_px = cell_centres_px(source.grid) + displacement
-    inside = ((target_px >= 0) & (target_px <= (width - 1, height - 1))).all(axis=1)
-    error = np.linalg.norm(displacement + sample_px(backward, target_px), axis=1)
-    tolerance = _FB_TOLERANCE_PX + _FB_TOLERANCE_RATIO * np.linalg.norm(displacement, axis=1)
+    inside = _inside(target_px, width, height)
+    error = length_px(displacement + sample_px(backward, target_px))
+    tolerance = _FB_TOLERANCE_PX + _FB_TOLERANCE_RATIO * length_px(displacement)
     agreement = np.exp(-np.square(error / tolerance))
     agreement[agreement < _MIN_FB_WEIGHT] = 0
     usable = inside & source.usable_cells
     if target.usable is not None:
         usable &= sample_px(target.usable.astype(np.float32), target_px) > 0.5
     # Against black, or anything else without structure, every flow agrees with its reverse.
-    strength = target.structure.max(axis=1).reshape(target.grid.height, target.grid.width)
+    strength = target.strength.reshape(target.grid.height, target.grid.width)
     seen = sample_px(strength, (target_px - target.grid.offset) / target.grid.stride)
-    usable &= (seen >= _BLANK_STRUCTURE) | (source.structure.max(axis=1) < _LOST_RATIO * seen)
+    usable &= (seen >= _BLANK_STRUCTURE) | (source.strength < _LOST_RATIO * seen)
     structure = source.structure / (source.structure + source.structure_floor)
     weight = np.where(usable, agreement, 0)[:, None] * structure
     consistent = float((error[usable] < tolerance[usable]).mean()) if usable.any() else 0.0

@@ -16,13 +16,13 @@ from numpy.typing import NDArray
 
 from vipe_core.ba.problem import Grid
 from vipe_core.compilation import vectorised
-from vipe_core.priors.classical.features import STRIDE, Array, FlowFeatures, sample_px
+from vipe_core.priors.classical.features import STRIDE, Array, FlowFeatures, larger, length_px, sample_px
 from vipe_core.priors.protocols import Match
 
 _RADIUS_PX = 8
 _BLUR_PX = 0.8
 _MAX_ITERATIONS = 8
-_ENOUGH_PX = 0.02
+_ENOUGH_PX = 0.05
 # Differences of the target position between neighbouring cells that disagree by more than this (per pixel) lie on two
 # surfaces: the side that distorts less is taken.
 _SAME_SURFACE = 0.15
@@ -54,7 +54,7 @@ def local_affine(target_px: Array, grid: Grid) -> NDArray[np.float32]:
     Args:
         target_px: (P, 2); NaN gives NaN around it.
     """
-    field = np.asarray(target_px, np.float64).reshape(grid.height, grid.width, 2)
+    field = np.asarray(target_px, np.float32).reshape(grid.height, grid.width, 2)
     columns = []
     for axis, unit in ((1, (1.0, 0.0)), (0, (0.0, 1.0))):
         step = np.diff(field, axis=axis) / grid.stride
@@ -63,10 +63,10 @@ def local_affine(target_px: Array, grid: Grid) -> NDArray[np.float32]:
             continue
         first, last = np.take(step, [0], axis), np.take(step, [-1], axis)
         before, after = np.concatenate([first, step], axis), np.concatenate([step, last], axis)
-        with np.errstate(invalid="ignore"):
-            same = np.linalg.norm(before - after, axis=-1, keepdims=True) < _SAME_SURFACE
-            calmer = np.linalg.norm(before - unit, axis=-1) <= np.linalg.norm(after - unit, axis=-1)
-        columns.append(np.where(same, 0.5 * (before + after), np.where(calmer[..., None], before, after)))
+        with np.errstate(invalid="ignore", over="ignore"):
+            same = length_px(before - after) < _SAME_SURFACE
+            calmer = length_px(before - unit) <= length_px(after - unit)
+        columns.append(np.where(same[..., None], 0.5 * (before + after), np.where(calmer[..., None], before, after)))
     return np.stack(columns, axis=-1).reshape(-1, 4).astype(np.float32)
 
 
@@ -88,12 +88,12 @@ class PatchAligner:
     def align(self, source: FlowFeatures, target: FlowFeatures, guess_px: Array) -> Match:
         """See `Aligner.align`."""
         target_px, information, residual = self._aligned(source, target, guess_px)
-        found = np.asarray(information.any(axis=1))
+        found = information[:, 0] + information[:, 2] > 0
         if target.usable is not None:
             found &= sample_px(target.usable.astype(np.float32), target_px) > 0.5
         weight = np.where(found[:, None], self._weight * _certainty(information, residual), 0)
-        looked = np.flatnonzero(source.textured_cells & np.isfinite(guess_px).all(axis=1))
-        consistent = float((weight[looked] > 0).any(axis=1).mean()) if len(looked) else 0.0
+        looked = np.flatnonzero(source.textured_cells & np.isfinite(guess_px[:, 0] + guess_px[:, 1]))
+        consistent = float((larger(weight)[looked] > 0).mean()) if len(looked) else 0.0
         return Match(target_px, weight.astype(np.float32), consistent)
 
     def _aligned(
@@ -103,7 +103,9 @@ class PatchAligner:
         patches in target coordinates, and (P, 2) mean square of what is left and of the patch about its mean."""
         grid = source.grid
         affine = local_affine(guess_px, grid)
-        wanted = source.usable_cells & np.isfinite(guess_px).all(axis=1) & np.isfinite(affine).all(axis=1)
+        wanted = source.usable_cells & np.isfinite(guess_px[:, 0] + guess_px[:, 1])
+        for column in affine.T:
+            wanted &= np.isfinite(column)
         start = np.where(wanted[:, None], guess_px, 0).astype(np.float32)
         y, x = np.mgrid[: grid.height, : grid.width].astype(np.int32) * STRIDE + (STRIDE // 2 - 1)
         target_px = np.nan_to_num(np.asarray(guess_px, np.float32))

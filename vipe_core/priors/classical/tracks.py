@@ -9,7 +9,15 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from vipe_core.priors.classical.features import STRIDE, Array, FlowFeatures, cell_centres_px, sample_px
+from vipe_core.priors.classical.features import (
+    STRIDE,
+    Array,
+    FlowFeatures,
+    cell_centres_px,
+    larger,
+    length_px,
+    sample_px,
+)
 from vipe_core.priors.protocols import Match
 
 _TERMINATION = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 20, 0.01)
@@ -17,6 +25,8 @@ _TERMINATION = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 20, 0.01)
 
 class LkTracker:
     """`SparseTracker` on the features of `DisFlowMatcher`.
+
+    The flow leads a track to within a pixel or two, the reach of one window: there is no pyramid.
 
     Args:
         window_px: Side of the Lucas-Kanade window.
@@ -47,16 +57,16 @@ class LkTracker:
         num_cells = source.grid.num_cells
         centres = cell_centres_px(source.grid)
         displacement = dense.target_px - centres
-        corners, flow, smooth = self._corners_with_flow(source, displacement, dense.weight.max(axis=1) > 0)
+        corners, flow, smooth = self._corners_with_flow(source, displacement, larger(dense.weight) > 0)
         if not len(corners):
             return Match(dense.target_px.copy(), np.zeros((num_cells, 2), np.float32), 0.0)
         forward, kept_forward = self._track(source.gray, target.gray, corners, corners + flow)
         back, kept_back = self._track(target.gray, source.gray, forward, corners)
-        error = np.linalg.norm(back - corners, axis=1)
+        error = length_px(back - corners)
         correction = forward - corners - flow
         height, width = target.gray.shape
         kept = kept_forward & kept_back & (error < self._max_fb_px)
-        kept &= (np.abs(correction).max(axis=1) < self._max_correction_px) & smooth
+        kept &= (larger(np.abs(correction)) < self._max_correction_px) & smooth
         kept &= ((forward >= 0) & (forward <= (width - 1, height - 1))).all(axis=1)
         if target.usable is not None:
             kept &= sample_px(target.usable.astype(np.float32), forward) > 0.5
@@ -89,8 +99,8 @@ class LkTracker:
         # Between cells that move differently (an edge of an object) the interpolated flow belongs to neither side.
         kernel = np.ones((3, 3), np.uint8)
         spread = np.stack([cv2.dilate(field[..., k], kernel) - cv2.erode(field[..., k], kernel) for k in (0, 1)], -1)
-        limit = 1.5 + 0.1 * np.linalg.norm(field, axis=-1)
-        calm = (spread.max(axis=-1) < limit) & known.reshape(grid.height, grid.width)
+        limit = 1.5 + 0.1 * length_px(field)
+        calm = (larger(spread) < limit) & known.reshape(grid.height, grid.width)
         return corners, flow, sample_px(calm.astype(np.float32), at_cells) > 0.5
 
     def _track(
@@ -102,7 +112,7 @@ class LkTracker:
             np.ascontiguousarray(points, np.float32)[:, None],
             np.ascontiguousarray(start, np.float32)[:, None].copy(),
             winSize=self._window,
-            maxLevel=1,
+            maxLevel=0,
             criteria=_TERMINATION,
             flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
             minEigThreshold=1e-4,
