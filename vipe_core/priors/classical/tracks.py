@@ -26,8 +26,6 @@ _TERMINATION = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 20, 0.01)
 class LkTracker:
     """`SparseTracker` on the features of `DisFlowMatcher`.
 
-    The flow leads a track to within a pixel or two, the reach of one window: there is no pyramid.
-
     Args:
         window_px: Side of the Lucas-Kanade window.
         max_fb_px: Tracks that do not come back within this distance are dropped.
@@ -112,7 +110,7 @@ class LkTracker:
             np.ascontiguousarray(points, np.float32)[:, None],
             np.ascontiguousarray(start, np.float32)[:, None].copy(),
             winSize=self._window,
-            maxLevel=0,
+            maxLevel=1,
             criteria=_TERMINATION,
             flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
             minEigThreshold=1e-4,
