@@ -1,4 +1,4 @@
-"""Compiled loops of the plane sweep: warping, correlation, semi-global aggregation, consistency, upsampling.
+"""Compiled loops of the plane sweep: warping, correlation, and consistency between frames.
 
 All geometry is written in inverse depth along the ray of the camera model: a pixel with ray r and inverse depth d is
 seen by another camera in direction R r + d t, with no division by d, so d = 0 (infinity) is an ordinary value.
@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vipe_core.compilation import compiled
+from vipe_core.compilation import compiled, vectorised
 
 Array = NDArray[Any]
 
@@ -43,37 +43,21 @@ def _project(model: int, params: Array, x: float, y: float, z: float) -> tuple[f
 
 
 @compiled
-def _window_statistics(image: Array, radius: int) -> tuple[Array, Array]:
-    """Mean and variance of the clipped box around every pixel."""
-    h, w = image.shape
-    mean, variance = np.empty((h, w), np.float32), np.empty((h, w), np.float32)
-    for y in range(h):
-        for x in range(w):
-            y0, y1, x0, x1 = max(0, y - radius), min(h, y + radius + 1), max(0, x - radius), min(w, x + radius + 1)
-            total, squares = 0.0, 0.0
-            for v in range(y0, y1):
-                for u in range(x0, x1):
-                    total += image[v, u]
-                    squares += image[v, u] * image[v, u]
-            n = (y1 - y0) * (x1 - x0)
-            mean[y, x] = total / n
-            variance[y, x] = max(0.0, squares / n - (total / n) ** 2)
-    return mean, variance
-
-
-@compiled
 def _warp_pinhole(
-    image: Array, turned: Array, t: Array, base: Array, offset: float, params: Array, warped: Array, seen: Array
+    image: Array, turned: Array, t: Array, base: Array, step: Array, offset: float, params: Array, warped: Array
 ) -> None:
-    """Samples `image` at every pixel for the inverse depths `base + offset`, all in float32 for speed."""
+    """Samples `image` at every pixel for the inverse depths `base + offset * step`, all in float32 for speed.
+
+    `warped` is a view of the size of `base`; what is not seen becomes NaN.
+    """
     h, w = base.shape
     fx, fy, cx, cy = params[0], params[1], params[2], params[3]
     tx, ty, tz = t[0], t[1], t[2]
-    zero, one, tiny = np.float32(0), np.float32(1), np.float32(1e-6)
+    zero, one, tiny, missing = np.float32(0), np.float32(1), np.float32(1e-6), np.float32(np.nan)
     right, bottom = np.float32(w - 1), np.float32(h - 1)
     for y in range(h):
         for x in range(w):
-            d = max(zero, base[y, x] + offset)
+            d = max(zero, base[y, x] + offset * step[y, x])
             z = turned[y, x, 2] + tz * d
             if z > tiny:
                 inverse = one / z
@@ -85,10 +69,8 @@ def _warp_pinhole(
                     upper = image[vi, ui] + fu * (image[vi, ui + 1] - image[vi, ui])
                     lower = image[vi + 1, ui] + fu * (image[vi + 1, ui + 1] - image[vi + 1, ui])
                     warped[y, x] = upper + fv * (lower - upper)
-                    seen[y, x] = one
                     continue
-            warped[y, x] = zero
-            seen[y, x] = zero
+            warped[y, x] = missing
 
 
 @compiled
@@ -97,17 +79,17 @@ def _warp(
     turned: Array,
     t: Array,
     base: Array,
+    step: Array,
     offset: float,
     model: int,
     params: Array,
     warped: Array,
-    seen: Array,
 ) -> None:
     """`_warp_pinhole` for any camera model."""
     h, w = base.shape
     for y in range(h):
         for x in range(w):
-            d = max(np.float32(0), base[y, x] + offset)
+            d = max(np.float32(0), base[y, x] + offset * step[y, x])
             u, v, length = _project(
                 model, params, turned[y, x, 0] + t[0] * d, turned[y, x, 1] + t[1] * d, turned[y, x, 2] + t[2] * d
             )
@@ -117,76 +99,98 @@ def _warp(
                 upper = image[vi, ui] + fu * (image[vi, ui + 1] - image[vi, ui])
                 lower = image[vi + 1, ui] + fu * (image[vi + 1, ui + 1] - image[vi + 1, ui])
                 warped[y, x] = upper + fv * (lower - upper)
-                seen[y, x] = 1
             else:
-                warped[y, x] = 0
-                seen[y, x] = 0
+                warped[y, x] = np.nan
 
 
-@compiled
+@vectorised
+def _supports(image: Array, radius: int, stride: int, edge: float) -> tuple[Array, Array, Array]:
+    """Adaptive support windows (Yoon and Kweon, PAMI 2006): pixels that look like the centre count most.
+
+    A window does not reach over the edge of a thing onto what is behind it, so that neither takes the other's depth.
+
+    Returns:
+        weights: (T, h, w) float32, sum 1 over the taps of a pixel; 0 outside of the picture.
+        products: (T, h, w) float32 weights times the grey level at the tap.
+        statistics: (2, h, w) float32 weighted mean and variance.
+    """
+    h, w = image.shape
+    side = 2 * (radius // stride) + 1
+    weights = np.zeros((side * side, h, w), np.float32)
+    products = np.zeros((side * side, h, w), np.float32)
+    statistics = np.zeros((2, h, w), np.float32)
+    reach = stride * (radius // stride)
+    for y in range(h):
+        for x in range(w):
+            total, mean, squares = 0.0, 0.0, 0.0
+            for i in range(side * side):
+                v, u = y + stride * (i // side) - reach, x + stride * (i % side) - reach
+                if v < 0 or u < 0 or v >= h or u >= w:
+                    continue
+                weight = math.exp(-abs(image[v, u] - image[y, x]) / edge)
+                weights[i, y, x] = weight
+                total += weight
+                mean += weight * image[v, u]
+                squares += weight * image[v, u] * image[v, u]
+            mean /= total
+            for i in range(side * side):
+                v, u = y + stride * (i // side) - reach, x + stride * (i % side) - reach
+                if v < 0 or u < 0 or v >= h or u >= w:
+                    continue
+                weights[i, y, x] /= total
+                products[i, y, x] = weights[i, y, x] * image[v, u]
+            statistics[0, y, x] = mean
+            statistics[1, y, x] = max(0.0, squares / total - mean * mean)
+    return weights, products, statistics
+
+
+@vectorised
 def _correlate(
-    reference: Array,
+    weights: Array,
+    products: Array,
     mean: Array,
     gain: Array,
     warped: Array,
-    seen: Array,
     radius: int,
+    stride: int,
     noise: float,
     first: Array,
     second: Array,
     count: Array,
 ) -> None:
-    """Correlation of all windows with the warped image; keeps the best two scores and counts the sources.
+    """Correlation of all windows with the warped pictures (D, h + 2 radius, w + 2 radius) of one source.
 
-    Column sums move down one row at a time; row sums are differences of prefix sums. The last loop has no branches, so
-    that the compiler can vectorise its root and its division.
+    Keeps the best two scores (D, h, w) and counts the sources. The inner loops have no branches, so that the compiler
+    can vectorise them; what is not seen is NaN and makes the sums of its window NaN.
     """
-    h, w = reference.shape
-    col = np.zeros((4, w), np.float64)
-    prefix = np.zeros((4, w + 2 * radius + 2), np.float64)
-    one, outside, floor = np.float32(1), np.float32(-2), np.float32(noise)
-    for y in range(-radius, h):
-        enter, leave = y + radius, y - radius - 1
-        if enter < h:
+    num_planes, h, w = first.shape
+    side = 2 * (radius // stride) + 1
+    start = radius - stride * (radius // stride)
+    sums = np.empty((3, w), np.float32)
+    floor, outside = np.float32(noise), np.float32(-2)
+    for y in range(h):
+        for k in range(num_planes):
+            sums[:] = 0
+            for i in range(side * side):
+                line = warped[k, y + start + stride * (i // side)]
+                shift = start + stride * (i % side)
+                share, product = weights[i, y], products[i, y]
+                for x in range(w):
+                    j = line[x + shift]
+                    part = share[x] * j
+                    sums[0, x] += part
+                    sums[1, x] += part * j
+                    sums[2, x] += product[x] * j
             for x in range(w):
-                j = warped[enter, x]
-                col[0, x] += j
-                col[1, x] += j * j
-                col[2, x] += j * reference[enter, x]
-                col[3, x] += seen[enter, x]
-        if leave >= 0:
-            for x in range(w):
-                j = warped[leave, x]
-                col[0, x] -= j
-                col[1, x] -= j * j
-                col[2, x] -= j * reference[leave, x]
-                col[3, x] -= seen[leave, x]
-        if y < 0:
-            continue
-        # prefix[x + radius + 1] is the sum of columns 0..x, flat on both sides.
-        s0, s1, s2, s3 = 0.0, 0.0, 0.0, 0.0
-        for x in range(w):
-            s0, s1, s2, s3 = s0 + col[0, x], s1 + col[1, x], s2 + col[2, x], s3 + col[3, x]
-            i = x + radius + 1
-            prefix[0, i], prefix[1, i], prefix[2, i], prefix[3, i] = s0, s1, s2, s3
-        for i in range(w + radius + 1, w + 2 * radius + 2):
-            prefix[0, i], prefix[1, i], prefix[2, i], prefix[3, i] = s0, s1, s2, s3
-        rows = min(h, enter + 1) - max(0, leave + 1)
-        for x in range(w):
-            n = np.float32(rows * (min(w, x + radius + 1) - max(0, x - radius)))
-            share = one / n
-            i = x + 2 * radius + 1
-            mj = np.float32(prefix[0, i] - prefix[0, x]) * share
-            jj = np.float32(prefix[1, i] - prefix[1, x]) * share
-            ij = np.float32(prefix[2, i] - prefix[2, x]) * share
-            whole = np.float32(prefix[3, i] - prefix[3, x]) > n - np.float32(0.5)
-            spread = max(np.float32(0), jj - mj * mj) + floor
-            value = (ij - mj * mean[y, x]) * gain[y, x] / np.float32(math.sqrt(spread))
-            score = value if whole else outside
-            best = first[y, x]
-            second[y, x] = max(second[y, x], min(best, score))
-            first[y, x] = max(best, score)
-            count[y, x] += np.uint8(whole)
+                mj = sums[0, x]
+                spread = max(np.float32(0), sums[1, x] - mj * mj) + floor
+                value = (sums[2, x] - mj * mean[y, x]) * gain[y, x] / np.float32(math.sqrt(spread))
+                whole = value == value
+                score = value if whole else outside
+                best = first[k, y, x]
+                second[k, y, x] = max(second[k, y, x], min(best, score))
+                first[k, y, x] = max(best, score)
+                count[k, y, x] += np.uint8(whole)
 
 
 @compiled
@@ -194,6 +198,7 @@ def sweep_cost(
     reference: Array,
     rays: Array,
     base: Array,
+    step: Array,
     offsets: Array,
     sources: Array,
     rotations: Array,
@@ -201,24 +206,28 @@ def sweep_cost(
     model: int,
     params: Array,
     radius: int,
+    stride: int,
+    edge: float,
     noise: float,
 ) -> Array:
-    """Matching cost of every pixel for the inverse depths `base + offsets[k]`.
+    """Matching cost of every pixel for the inverse depths `base + offsets[k] * step`.
 
-    The cost is 1 minus the zero-mean normalised cross-correlation, averaged over the better half of the sources that
-    see the window: what is hidden in one direction is usually visible in another.
+    The cost is 1 minus the zero-mean normalised cross-correlation of adaptive support windows, averaged over the better
+    half of the sources that see the window: what is hidden in one direction is usually visible in another.
 
     Args:
         reference: (h, w) float32 gray.
         rays: (h, w, 3) float32 rays of its pixels.
-        base: (h, w) float32.
+        base, step: (h, w) float32.
         offsets: (D,) float32.
-        sources: (S, h, w) float32 gray images of the same camera.
+        sources: (S, h, w) float32 gray images of the same camera, NaN on pixels that must not be used.
         rotations: (S, 3, 3) float32 source_from_reference.
         translations: (S, 3) float32.
         model: Code of the camera model.
         params: (5,) float32 index parameters at this resolution.
         radius: Half side of the window.
+        stride: Distance of the pixels of a window that count.
+        edge: Grey-level difference to the centre that lowers the weight of a pixel by a factor e.
         noise: Variance that is added to both windows'.
 
     Returns:
@@ -228,14 +237,13 @@ def sweep_cost(
     num_planes, num_sources = len(offsets), len(sources)
     # Grey levels around zero keep the products small for float32.
     level = np.float32(reference.mean())
-    centred = reference - level
-    mean, variance = _window_statistics(centred, radius)
-    gain = (1 / np.sqrt(variance + np.float32(noise))).astype(np.float32)
+    weights, products, statistics = _supports(reference - level, radius, stride, edge)
+    gain = (1 / np.sqrt(statistics[1] + np.float32(noise))).astype(np.float32)
     first = np.full((num_planes, h, w), np.float32(-2), np.float32)
     second = np.full((num_planes, h, w), np.float32(-2), np.float32)
     count = np.zeros((num_planes, h, w), np.uint8)
     turned = np.empty((h, w, 3), np.float32)
-    warped, seen = np.empty((h, w), np.float32), np.empty((h, w), np.float32)
+    warped = np.zeros((num_planes, h + 2 * radius, w + 2 * radius), np.float32)
     for s in range(num_sources):
         r, t, image = rotations[s], translations[s], sources[s] - level
         for y in range(h):
@@ -243,11 +251,12 @@ def sweep_cost(
                 for c in range(3):
                     turned[y, x, c] = r[c, 0] * rays[y, x, 0] + r[c, 1] * rays[y, x, 1] + r[c, 2] * rays[y, x, 2]
         for k in range(num_planes):
+            inner = warped[k, radius : radius + h, radius : radius + w]
             if model == 0:
-                _warp_pinhole(image, turned, t, base, offsets[k], params, warped, seen)
+                _warp_pinhole(image, turned, t, base, step, offsets[k], params, inner)
             else:
-                _warp(image, turned, t, base, offsets[k], model, params, warped, seen)
-            _correlate(centred, mean, gain, warped, seen, radius, noise, first[k], second[k], count[k])
+                _warp(image, turned, t, base, step, offsets[k], model, params, inner)
+        _correlate(weights, products, statistics[0], gain, warped, radius, stride, noise, first, second, count)
     cost = np.empty((h, w, num_planes), np.float32)
     half = np.float32(0.5)
     for y in range(h):
@@ -263,88 +272,6 @@ def sweep_cost(
 
 
 @compiled
-def add_prior(cost: Array, position: Array, confidence: Array, gain: float, reach: float) -> None:
-    """Adds a truncated cost of leaving plane `position` (h, w), in place; `confidence` (h, w) scales it."""
-    h, w, num_planes = cost.shape
-    for y in range(h):
-        for x in range(w):
-            if confidence[y, x] > 0:
-                scale = np.float32(gain * confidence[y, x])
-                for k in range(num_planes):
-                    away = abs(k - position[y, x]) / reach
-                    cost[y, x, k] += scale * np.float32(min(1.0, away))
-
-
-@compiled
-def _pass(
-    cost: Array, gray: Array, total: Array, small: float, large: float, edge: float, vertical: bool, backward: bool
-) -> None:
-    """One direction of the aggregation."""
-    h, w, n = cost.shape
-    lines, length = (w, h) if vertical else (h, w)
-    far = np.float32(1e9)
-    p1 = np.float32(small)
-    previous, current = np.full(n + 2, far, np.float32), np.full(n + 2, far, np.float32)
-    for line in range(lines):
-        lowest = np.float32(0)
-        last_gray = np.float32(0)
-        for step in range(length):
-            i = length - 1 - step if backward else step
-            y, x = (i, line) if vertical else (line, i)
-            value = gray[y, x]
-            smallest = far
-            if step == 0:
-                for k in range(n):
-                    current[k + 1] = cost[y, x, k]
-                    smallest = min(smallest, current[k + 1])
-            else:
-                p2 = np.float32(max(2 * small, large * math.exp(-abs(value - last_gray) / edge)))
-                jump = lowest + p2
-                for k in range(n):
-                    best = min(min(previous[k + 1], previous[k] + p1), min(previous[k + 2] + p1, jump))
-                    current[k + 1] = cost[y, x, k] + best - lowest
-                for k in range(n):
-                    smallest = min(smallest, current[k + 1])
-            for k in range(n):
-                total[y, x, k] += current[k + 1]
-            previous, current = current, previous
-            lowest, last_gray = smallest, value
-
-
-@compiled
-def aggregate(cost: Array, gray: Array, small: float, large: float, edge: float) -> Array:
-    """Semi-global aggregation along four directions (Hirschmueller 2008, equation 13): (h, w, D) float32."""
-    total = np.zeros_like(cost)
-    _pass(cost, gray, total, small, large, edge, False, False)
-    _pass(cost, gray, total, small, large, edge, False, True)
-    _pass(cost, gray, total, small, large, edge, True, False)
-    _pass(cost, gray, total, small, large, edge, True, True)
-    return total
-
-
-@compiled
-def winner(total: Array, cost: Array) -> tuple[Array, Array]:
-    """Position of the lowest aggregated cost with a parabola through its neighbours, and the raw cost there."""
-    h, w, n = total.shape
-    position, raw = np.empty((h, w), np.float32), np.empty((h, w), np.float32)
-    for y in range(h):
-        for x in range(w):
-            best = 0
-            for k in range(1, n):
-                if total[y, x, k] < total[y, x, best]:
-                    best = k
-            offset = 0.0
-            if 0 < best < n - 1:
-                before, here, after = total[y, x, best - 1], total[y, x, best], total[y, x, best + 1]
-                bend = before - 2 * here + after
-                if bend > 1e-9:
-                    offset = max(-0.5, min(0.5, 0.5 * (before - after) / bend))
-            position[y, x] = best + offset
-            raw[y, x] = cost[y, x, best]
-    return position, raw
-
-
-@compiled
 def check(
     inverse_depth: Array,
     rays: Array,
@@ -354,12 +281,17 @@ def check(
     model: int,
     params: Array,
     tolerance: float,
+    slack: float,
+    asked: Array,
+    hidden: Array,
     votes: Array,
     ratios: Array,
 ) -> None:
-    """Where another frame's depth map confirms this one; adds to `votes` and `ratios` (h, w) in place.
+    """Where another frame's depth map confirms this one; adds to the last four arrays (h, w) in place.
 
-    A confirmed pixel gets one vote and the ratio of the other frame's inverse depth to the predicted one.
+    A pixel that lands in the other picture is asked there. It is confirmed where the inverse depths differ by no more
+    than `tolerance` of the predicted one plus `slack`: one vote, and the ratio of the two. It is hidden where the other
+    frame sees something nearer, which is no contradiction.
     """
     h, w = inverse_depth.shape
     for y in range(h):
@@ -376,60 +308,12 @@ def check(
             ui, vi = math.floor(u + 0.5), math.floor(v + 0.5)
             if length <= 0 or ui < 0 or vi < 0 or ui >= w or vi >= h:
                 continue
-            predicted = d / length
-            ratio = other[vi, ui] / max(predicted, 1e-12)
-            if abs(ratio - 1) < tolerance:
+            predicted = max(d / length, 1e-12)
+            nearer = other[vi, ui] - predicted
+            bound = tolerance * predicted + slack
+            asked[y, x] += 1
+            if nearer > bound:
+                hidden[y, x] += 1
+            elif nearer >= -bound:
                 votes[y, x] += 1
-                ratios[y, x] += ratio
-
-
-@compiled
-def upsample(
-    inverse_depth: Array, confidence: Array, gray: Array, full_gray: Array, edge: float, same: float
-) -> tuple[Array, Array]:
-    """Depth (not inverse) and confidence at the size of `full_gray`, following its edges.
-
-    Each pixel looks at the four low-resolution samples around it, weighs them by distance and by grey-level difference,
-    and averages those that lie on the surface of the heaviest one: no values between foreground and background.
-
-    Args:
-        inverse_depth, confidence, gray: (h, w) float32.
-        full_gray: (H, W) uint8.
-        edge: Grey-level difference that lowers a weight by a factor e.
-        same: Relative difference in inverse depth within which two samples are one surface.
-    """
-    h, w = inverse_depth.shape
-    rows, cols = full_gray.shape
-    depth, sure = np.empty((rows, cols), np.float32), np.empty((rows, cols), np.float32)
-    decay = np.empty(256, np.float32)
-    for i in range(256):
-        decay[i] = math.exp(-i / edge) + 1e-4
-    weight, value, trust = np.empty(4, np.float32), np.empty(4, np.float32), np.empty(4, np.float32)
-    for y in range(rows):
-        v = (y + 0.5) * h / rows - 0.5
-        v0 = math.floor(v)
-        fv = v - v0
-        for x in range(cols):
-            u = (x + 0.5) * w / cols - 0.5
-            u0 = math.floor(u)
-            fu = u - u0
-            heaviest = 0
-            for i in range(4):
-                yy = min(max(v0 + i // 2, 0), h - 1)
-                xx = min(max(u0 + i % 2, 0), w - 1)
-                near = (fv if i // 2 else 1 - fv) * (fu if i % 2 else 1 - fu) + 1e-3
-                difference = abs(np.float32(full_gray[y, x]) - gray[yy, xx])
-                weight[i] = near * decay[min(255, int(difference))]
-                value[i] = inverse_depth[yy, xx]
-                trust[i] = confidence[yy, xx]
-                if weight[i] > weight[heaviest]:
-                    heaviest = i
-            total, mean, mean_trust = 0.0, 0.0, 0.0
-            for i in range(4):
-                if abs(value[i] - value[heaviest]) <= same * value[heaviest]:
-                    total += weight[i]
-                    mean += weight[i] * value[i]
-                    mean_trust += weight[i] * trust[i]
-            depth[y, x] = total / mean
-            sure[y, x] = mean_trust / total
-    return depth, sure
+                ratios[y, x] += other[vi, ui] / predicted

@@ -18,21 +18,28 @@ from numpy.typing import NDArray
 
 from vipe_core.ba.problem import Grid
 from vipe_core.depth.completion import complete
+from vipe_core.depth.consistency import Confirmed, confirm
 from vipe_core.depth.geometry import KeyframePrior, Prior, choose_sources, relative
-from vipe_core.depth.kernels import check, upsample
+from vipe_core.depth.sky import find_sky
 from vipe_core.depth.sweep import PlaneSweep, RawDepth
-from vipe_core.depth.types import FILLED, MEASURED, MOVING, UNOBSERVED, DepthFrame, DepthSettings, SceneMap
+from vipe_core.depth.types import FILLED, MEASURED, MOVING, SKY, UNOBSERVED, DepthFrame, DepthSettings, SceneMap
+from vipe_core.depth.upsampling import upsample
 from vipe_core.errors import EngineError
 from vipe_core.slam.segmentation import segment
 from vipe_core.video.source import Frame, FrameSource
 
 Array = NDArray[Any]
 
-# A correlation of the first says nothing, of the second as much as it can.
-_MIN_SCORE, _SURE_SCORE = 0.2, 0.7
-# Belief in a value of high correlation when there is no other frame to ask, and the least belief that counts.
-_LONE_BELIEF, _MIN_BELIEF = 0.4, 0.2
-_LEAST_WEIGHT = 0.2
+# Weight of what bundle adjustment is sure of, beside 1 of a sure measurement.
+_HINT = 0.003
+# Confidence of what is filled in right beside a measurement. It falls by a factor e over the first share of the width
+# of the picture, and nothing is known after so many times that.
+_FILL_CONFIDENCE = 0.05
+_FILL_REACH, _LOST_REACH = 0.06, 4.0
+# The sky is so much further than the far end of what is measured.
+_SKY_QUANTILE, _SKY_SHARE = 0.01, 0.3
+# No inverse depth is below the first or above the second, in units of the ends of its range.
+_FAR_LIMIT, _NEAR_LIMIT = 0.05, 8.0
 # Without parallax, the keyframes' values go out with this share of their own confidence.
 _PRIOR_SHARE = 0.3
 # Enlarging: grey levels that lower a weight by e, and the relative difference that is still the same surface.
@@ -44,10 +51,12 @@ class _Picture:
     """A frame at half of the working size.
 
     Attributes:
+        rgb: (h, w, 3) uint8.
         gray: (h, w) uint8.
         moving: (h, w) bool, what moves by itself or must not be used.
     """
 
+    rgb: NDArray[np.uint8]
     gray: NDArray[np.uint8]
     moving: NDArray[np.bool_]
 
@@ -85,7 +94,9 @@ class DenseDepth:
                         decoded += 1
                     priors[t] = keyframes.of(t)
                     chosen = choose_sources(scene, sweep.coarse, priors[t], t, settings)
-                    raws[t] = sweep.depth(t, pictures[t].gray, {j: pictures[j].gray for j in chosen}, priors[t])
+                    raws[t] = sweep.depth(
+                        t, pictures[t].gray, {j: (pictures[j].gray, pictures[j].moving) for j in chosen}, priors[t]
+                    )
                 done = t - reach
                 if done >= 0:
                     frame = _next(behind, done, num_frames)
@@ -104,55 +115,64 @@ class DenseDepth:
         sweep: PlaneSweep,
     ) -> DepthFrame:
         """Confirms, fuses, fills and enlarges the depth of one frame."""
-        settings, view, raw = self._settings, sweep.fine, raws[index]
+        settings, raw = self._settings, raws[index]
         gray = picture.gray.astype(np.float32)
-        height, width = gray.shape
-        prior_value = cv2.resize(prior.inverse_depth, (width, height), interpolation=cv2.INTER_LINEAR)
-        prior_trust = cv2.resize(prior.confidence, (width, height), interpolation=cv2.INTER_LINEAR)
+        size = gray.shape[::-1]
+        prior_value = cv2.resize(prior.inverse_depth, size, interpolation=cv2.INTER_LINEAR)
+        prior_trust = cv2.resize(prior.confidence, size, interpolation=cv2.INTER_LINEAR)
         if raw.measured:
-            value = raw.inverse_depth
-            votes, ratios = np.zeros_like(gray), np.zeros_like(gray)
-            asked = 0
             start, stop = scene.shot_of(index)
-            for j in (index + s * d for d in settings.check_frames for s in (-1, 1)):
-                other = raws.get(j) if start <= j < stop else None
-                if other is None or not other.measured:
-                    continue
-                asked += 1
-                motion = relative(scene.world_from_cam, index, j)
-                check(
-                    value,
-                    view.rays,
-                    other.inverse_depth,
-                    motion[:3, :3].astype(np.float32),
-                    motion[:3, 3].astype(np.float32),
-                    view.model,
-                    view.params,
-                    settings.check_tolerance,
-                    votes,
-                    ratios,
-                )
-            agrees = prior_trust * (np.abs(value / prior_value - 1) < settings.check_tolerance)
-            # Without neighbours to ask, a high correlation has to do.
-            share = votes / asked if asked else (raw.score > _SURE_SCORE) * np.float32(_LONE_BELIEF)
-            believed = np.maximum(share, 0.5 * agrees)
-            confidence = believed * np.clip((raw.score - _MIN_SCORE) / (_SURE_SCORE - _MIN_SCORE), 0.05, 1)
-            confidence[believed < _MIN_BELIEF] = 0
-            value = value * (1 + ratios) / (1 + votes)
-            confidence = confidence.astype(np.float32)
-            weight = np.where(confidence > 0, np.maximum(confidence, _LEAST_WEIGHT), 0).astype(np.float32)
-            value = complete(value, weight, gray, prior_value)
+            others = [
+                (relative(scene.world_from_cam, index, j), raws[j])
+                for j in (index + sign * distance for distance in settings.check_frames for sign in (-1, 1))
+                if start <= j < stop and raws[j].measured
+            ]
+            found = confirm(raw, others, sweep.fine, prior, picture.moving, settings)
+            value, confidence, kind = self._completed(found, picture, prior_value, prior_trust)
         else:
-            value, confidence = prior_value, (_PRIOR_SHARE * prior_trust).astype(np.float32)
-        filled = FILLED if raw.measured or prior_trust.any() else UNOBSERVED
-        value = np.clip(value, 0.2 * prior.low, 4 * prior.high).astype(np.float32)
+            value, confidence = prior_value, _PRIOR_SHARE * prior_trust
+            kind = np.where(prior_trust > 0, FILLED, UNOBSERVED)
+        kind = np.where(picture.moving, MOVING, kind).astype(np.uint8)
+        confidence = np.where(picture.moving, 0, confidence).astype(np.float32)
+        value = np.clip(value, _FAR_LIMIT * prior.low, _NEAR_LIMIT * prior.high).astype(np.float32)
         full_gray = cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY)
         depth, sure = upsample(value, confidence, gray, full_gray, _EDGE, _SAME)
-        moving = _enlarged(picture.moving, full_gray.shape)
+        kind = np.asarray(cv2.resize(kind, full_gray.shape[::-1], interpolation=cv2.INTER_NEAREST), np.uint8)
+        moving = kind == MOVING
         if frame.masked is not None:
             moving |= frame.masked
-        kind = np.where(moving, MOVING, np.where(sure > 0, MEASURED, filled)).astype(np.uint8)
+            kind[moving] = MOVING
         return DepthFrame(index, frame.rgb, depth, np.clip(sure, 0, 1), kind, moving)
+
+    def _completed(
+        self, found: Confirmed, picture: _Picture, prior_value: Array, prior_trust: Array
+    ) -> tuple[Array, NDArray[np.float32], NDArray[np.uint8]]:
+        """Inverse depth of every pixel, how sure it is, and where it comes from."""
+        settings = self._settings
+        sky = find_sky(picture.rgb, found.inverse_depth, found.belief, picture.moving)
+        measured = (found.belief > 0) & ~sky
+        # Where nothing is measured, what bundle adjustment found is a hint.
+        unknown = found.weight == 0
+        weight = np.where(unknown, np.where(picture.moving, 0, _HINT * prior_trust**2), found.weight)
+        if not (weight[~sky] > 0).any():
+            return prior_value, np.zeros_like(found.belief), np.full(sky.shape, UNOBSERVED, np.uint8)
+        value = complete(
+            np.where(unknown, prior_value, found.inverse_depth),
+            weight,
+            picture.rgb,
+            sky,
+            settings.fill_smoothness,
+            settings.fill_edge,
+            settings.fill_tolerance,
+        )
+        away_px = cv2.distanceTransform((~measured).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+        reach_px = _FILL_REACH * sky.shape[1]
+        confidence = np.where(measured, found.belief, _FILL_CONFIDENCE * np.exp(-away_px / reach_px))
+        kind = np.where(measured, MEASURED, np.where(away_px < _LOST_REACH * reach_px, FILLED, UNOBSERVED))
+        if sky.any():
+            value[sky] = _SKY_SHARE * np.quantile(found.inverse_depth[measured], _SKY_QUANTILE)
+            confidence[sky], kind[sky] = _FILL_CONFIDENCE, SKY
+        return value, confidence.astype(np.float32), kind.astype(np.uint8)
 
 
 def _half(frame: Frame, scene: SceneMap) -> _Picture:
@@ -164,12 +184,7 @@ def _half(frame: Frame, scene: SceneMap) -> _Picture:
         moving |= segment(rgb, scene.labels[frame.index], grid) > 0
     if frame.masked is not None:
         moving |= cv2.resize(frame.masked.astype(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST) > 0
-    return _Picture(np.asarray(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), np.uint8), moving)
-
-
-def _enlarged(mask: NDArray[np.bool_], shape: tuple[int, ...]) -> NDArray[np.bool_]:
-    share = cv2.resize(mask.astype(np.float32), (shape[1], shape[0]), interpolation=cv2.INTER_LINEAR)
-    return np.asarray(share > 0.5)
+    return _Picture(rgb, np.asarray(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), np.uint8), moving)
 
 
 def _next(frames: Iterator[Frame], index: int, num_frames: int) -> Frame:

@@ -9,14 +9,22 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from vipe_core.depth.aggregation import add_prior, aggregate, winner
 from vipe_core.depth.geometry import Prior, View, relative
-from vipe_core.depth.kernels import add_prior, aggregate, sweep_cost, upsample, winner
+from vipe_core.depth.kernels import sweep_cost
 from vipe_core.depth.types import DepthSettings, SceneMap
+from vipe_core.depth.upsampling import upsample
 
 Array = NDArray[Any]
 
 _UPSAMPLE_EDGE = 8.0
 _UPSAMPLE_SAME = 0.1
+
+
+# The hypotheses go on beyond the range of the prior: this many even steps further away, and by growing steps up to so
+# many times nearer, for things that adjustment could not place.
+_FARTHER_STEPS = 4
+_NEARER, _STEP_GROWTH = 2.5, 1.06
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,11 +34,13 @@ class RawDepth:
     Attributes:
         inverse_depth: (h, w) float32 at half of the working size.
         score: (h, w) float32 correlation at the answer, 0..1; 0 everywhere without sources.
+        margin: (h, w) float32 how much better the answer correlates than any other, 0..2.
         measured: Whether any source was there.
     """
 
     inverse_depth: NDArray[np.float32]
     score: NDArray[np.float32]
+    margin: NDArray[np.float32]
     measured: bool
 
 
@@ -44,73 +54,98 @@ class PlaneSweep:
         self.coarse = View.of(scene.camera.resized(width // 4, height // 4))
         self.fine = View.of(scene.camera.resized(width // 2, height // 2))
 
-    def depth(self, frame: int, half: Array, sources: dict[int, Array], prior: Prior) -> RawDepth:
+    def depth(
+        self, frame: int, half: Array, sources: dict[int, tuple[NDArray[np.uint8], NDArray[np.bool_]]], prior: Prior
+    ) -> RawDepth:
         """Inverse depth of a frame.
 
         Args:
             frame: Index.
             half: (h, w) uint8 gray at half of the working size.
-            sources: Frame index -> gray at the same size.
+            sources: Frame index -> gray at the same size, and where it must not be used.
             prior: What bundle adjustment says about this frame.
         """
         height, width = half.shape
         if not sources:
             start = cv2.resize(prior.inverse_depth, (width, height), interpolation=cv2.INTER_LINEAR)
-            return RawDepth(np.asarray(start, np.float32), np.zeros_like(half, np.float32), False)
+            nothing = np.zeros_like(half, np.float32)
+            return RawDepth(np.asarray(start, np.float32), nothing, nothing, False)
         settings = self._settings
         motion = [relative(self._scene.world_from_cam, frame, j) for j in sources]
         rotations = np.array([m[:3, :3] for m in motion], np.float32)
         translations = np.array([m[:3, 3] for m in motion], np.float32)
 
+        def cost_of(view: View, gray: Array, base: Array, step: Array, offsets: Array, images: Array, r: int) -> Array:
+            return np.asarray(
+                sweep_cost(
+                    gray,
+                    view.rays,
+                    base,
+                    step,
+                    offsets,
+                    images,
+                    rotations,
+                    translations,
+                    view.model,
+                    view.params,
+                    r,
+                    settings.support_stride,
+                    settings.support_edge,
+                    settings.noise,
+                )
+            )
+
         size = (width // 2, height // 2)
         gray = _quarter(half)
-        planes = np.linspace(prior.low, prior.high, settings.planes, dtype=np.float32)
-        step = float(planes[1] - planes[0])
-        cost = sweep_cost(
-            gray,
-            self.coarse.rays,
-            np.zeros_like(gray),
-            planes,
-            np.stack([_quarter(image) for image in sources.values()]),
-            rotations,
-            translations,
-            self.coarse.model,
-            self.coarse.params,
-            settings.coarse_radius,
-            settings.noise,
+        planes = hypotheses(prior.low, prior.high, settings.planes)
+        images = np.stack([_usable(image, masked) for image, masked in sources.values()])
+        small = np.stack([cv2.resize(image, size, interpolation=cv2.INTER_AREA) for image in images])
+        cost = cost_of(
+            self.coarse, gray, np.zeros_like(gray), np.ones_like(gray), planes, small, settings.coarse_radius
         )
         guess = cv2.resize(prior.inverse_depth, size, interpolation=cv2.INTER_LINEAR)
         trust = cv2.resize(prior.confidence, size, interpolation=cv2.INTER_LINEAR)
         matching = cost.copy()
-        add_prior(cost, (guess - planes[0]) / step, trust, settings.prior_gain, settings.prior_reach)
-        position, raw = winner(self._aggregated(cost, gray), matching)
-        coarse = planes[0] + position * step
+        numbers = np.arange(len(planes), dtype=np.float32)
+        position = np.interp(guess, planes, numbers).astype(np.float32)
+        add_prior(cost, position, trust, settings.prior_gain, settings.prior_reach)
+        position, raw, margin = winner(self._aggregated(cost, gray), matching)
+        coarse = np.interp(position, numbers, planes).astype(np.float32)
+        reach = settings.fine_reach * np.interp(position, numbers, np.gradient(planes)).astype(np.float32)
 
         fine_gray = half.astype(np.float32)
+        coarse = np.maximum(coarse, np.float32(0.05 * prior.low))
         depth, _ = upsample(coarse, np.clip(1 - raw, 0, 1), gray, half, _UPSAMPLE_EDGE, _UPSAMPLE_SAME)
         base = 1 / depth
-        offsets = np.linspace(-1, 1, settings.fine_planes, dtype=np.float32) * np.float32(settings.fine_reach * step)
-        cost = sweep_cost(
-            fine_gray,
-            self.fine.rays,
-            base,
-            offsets,
-            np.stack([image.astype(np.float32) for image in sources.values()]),
-            rotations,
-            translations,
-            self.fine.model,
-            self.fine.params,
-            settings.fine_radius,
-            settings.noise,
-        )
-        position, raw = winner(self._aggregated(cost, fine_gray), cost)
-        found = base + offsets[0] + position * float(offsets[1] - offsets[0])
-        found = np.clip(found, 0.2 * prior.low, 2 * prior.high).astype(np.float32)
-        return RawDepth(found, np.clip(1 - raw, 0, 1).astype(np.float32), True)
+        step = cv2.resize(reach, (width, height), interpolation=cv2.INTER_LINEAR)
+        offsets = np.linspace(-1, 1, settings.fine_planes, dtype=np.float32)
+        cost = cost_of(self.fine, fine_gray, base, step, offsets, images, settings.fine_radius)
+        position, raw, _ = winner(self._aggregated(cost, fine_gray), cost)
+        found = base + step * (offsets[0] + position * (offsets[1] - offsets[0]))
+        found = np.maximum(found, 0.05 * prior.low).astype(np.float32)
+        sure = cv2.resize(margin, (width, height), interpolation=cv2.INTER_LINEAR)
+        return RawDepth(found, np.clip(1 - raw, 0, 1).astype(np.float32), np.asarray(sure, np.float32), True)
 
     def _aggregated(self, cost: Array, gray: Array) -> Array:
         s = self._settings
-        return aggregate(cost, gray, s.smooth_small, s.smooth_large, s.smooth_edge)
+        return np.asarray(aggregate(cost, gray, s.smooth_small, s.smooth_large, s.smooth_edge))
+
+
+def hypotheses(low: float, high: float, count: int) -> NDArray[np.float32]:
+    """Increasing inverse depths: `count` even steps from `low` to `high`, some beyond on the far side (not below 0),
+    and growing steps on the near side."""
+    step = (high - low) / (count - 1)
+    further = min(_FARTHER_STEPS, int(low / step))
+    even = low + step * np.arange(-further, count)
+    nearer = [high]
+    while nearer[-1] < _NEARER * high:
+        step *= _STEP_GROWTH
+        nearer.append(nearer[-1] + step)
+    return np.concatenate([even, nearer[1:]]).astype(np.float32)
+
+
+def _usable(image: NDArray[np.uint8], masked: NDArray[np.bool_]) -> NDArray[np.float32]:
+    return np.where(masked, np.float32(np.nan), image.astype(np.float32))
 
 
 def _quarter(half: Array) -> NDArray[np.float32]:

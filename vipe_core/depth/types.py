@@ -29,6 +29,8 @@ class DepthSettings:
         fine_planes: Hypotheses around the coarse answer at half of the working resolution (odd).
         fine_reach: How far they reach to either side, in coarse steps.
         coarse_radius, fine_radius: Half sides of the matching windows.
+        support_stride: Distance of the pixels of a window that count.
+        support_edge: Grey-level difference to the centre of the window at which a pixel counts less by a factor e.
         noise: Variance of a flat window, (grey levels)^2: below it, correlation says nothing.
         smooth_small: Penalty of a change by one plane between neighbours.
         smooth_large: Penalty of a larger change.
@@ -37,6 +39,9 @@ class DepthSettings:
         prior_reach: Planes after which that cost no longer grows.
         check_frames: Distances to the frames whose depth must agree.
         check_tolerance: Relative difference in inverse depth that still agrees.
+        fill_smoothness: Weight of a difference between neighbours that look the same, beside a sure measurement's 1.
+        fill_edge: Difference in colour, in grey levels, that lowers it by a factor e.
+        fill_tolerance: Relative difference to its surroundings at which a measurement counts a quarter.
     """
 
     window_frames: int = 60
@@ -48,14 +53,19 @@ class DepthSettings:
     fine_reach: float = 1.5
     coarse_radius: int = 2
     fine_radius: int = 2
+    support_stride: int = 1
+    support_edge: float = 20.0
     noise: float = 2.0
     smooth_small: float = 0.1
     smooth_large: float = 1.2
     smooth_edge: float = 12.0
     prior_gain: float = 0.2
     prior_reach: float = 3.0
-    check_frames: tuple[int, ...] = (3, 6)
-    check_tolerance: float = 0.03
+    check_frames: tuple[int, ...] = (3, 6, 10)
+    check_tolerance: float = 0.06
+    fill_smoothness: float = 0.3
+    fill_edge: float = 4.0
+    fill_tolerance: float = 0.1
 
 
 @dataclass(frozen=True, slots=True)
