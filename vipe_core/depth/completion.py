@@ -93,7 +93,7 @@ def _solved(measured: Array, weight: Array, links: list[tuple[Array, Array]], me
         if solution.shape[1:] != pull.shape:
             solution = _finer(solution, *pull.shape)
         _relax(solution, pull, hold, right, down, _STIFFNESS / 4**level, _LEVELLING, _SWEEPS)
-    return solution[0]
+    return np.asarray(solution[0])
 
 
 @compiled
