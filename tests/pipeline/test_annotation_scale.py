@@ -1,4 +1,4 @@
-"""The scale of an annotation: relative and normalised, from a known length, or from metric depth."""
+"""The scale of an annotation, and its depth where the preset has a video depth model."""
 
 from __future__ import annotations
 
@@ -9,17 +9,22 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
-from vipe_core.annotation import Annotation, DepthKind
-from vipe_core.cameras import Camera
+from vipe_core.annotation import Annotation
 from vipe_core.errors import ConfigError, ScaleUnobservable
 from vipe_core.evaluation.synthetic.clip import SyntheticClip, tiny_clip
+from vipe_core.evaluation.synthetic.depth_models import (
+    DistortedVideoDepth,
+    Distortion,
+    NearestCompletion,
+    NoisyMetricDepth,
+)
 from vipe_core.geometry import umeyama
 from vipe_core.pipeline.annotator import Annotator
 from vipe_core.pipeline.presets import resolve
 from vipe_core.pipeline.providers import open_depth, register_depth
-from vipe_core.priors.protocols import DepthFamily, MetricEstimate
+from vipe_core.priors.protocols import DepthFamily
+from vipe_core.video import open_source
 
 
 @pytest.fixture(scope="module")
@@ -84,32 +89,9 @@ def test_what_cannot_be_found_is_said(folder: Path, tmp_path: Path) -> None:
         Annotator().annotate(tmp_path / "not even looked for", scale_from="tall")
 
 
-class NoisyMetric:
-    """Exact metric depth times an error per picture, some of them far off."""
-
-    depth_kind: DepthKind = "z"
-    shared_sigma_ratio = 0.0
-
-    def __init__(self, clip: SyntheticClip) -> None:
-        self._clip = clip
-        self._rng = np.random.default_rng(1)
-        self._calls = 0
-
-    def input_size(self, width: int, height: int) -> tuple[int, int]:
-        return width // 2, height // 2
-
-    def estimate(self, rgb: NDArray[np.uint8], camera: Camera) -> MetricEstimate:
-        small = [cv2.resize(f, (camera.width, camera.height), interpolation=cv2.INTER_AREA) for f in self._clip.rgb]
-        assert rgb.shape[:2] == (camera.height, camera.width)
-        index = int(np.argmin([np.abs(f.astype(float) - rgb).mean() for f in small]))
-        depth = cv2.resize(self._clip.depth[index], (camera.width, camera.height), interpolation=cv2.INTER_NEAREST)
-        self._calls += 1
-        wrong = 3.0 if self._calls % 5 == 2 else math.exp(0.05 * self._rng.standard_normal())
-        return MetricEstimate((wrong * depth).astype(np.float32), np.ones_like(depth))
-
-
 def test_metric_depth_makes_the_scale_metric(folder: Path, clip: SyntheticClip) -> None:
-    register_depth("test.metric", lambda device: DepthFamily(metric=NoisyMetric(clip)))
+    metric = NoisyMetricDepth(open_source(folder), clip.depth, "z", (96, 72), sigma=0.05, wrong=0.2, seed=2)
+    register_depth("test.metric", lambda device: DepthFamily(metric=metric))
     stages: list[str] = []
     annotator = Annotator(replace(resolve("classical"), depth="test.metric"))
     annotation = annotator.annotate(folder, progress=lambda p: stages.append(p.stage))
@@ -122,6 +104,30 @@ def test_metric_depth_makes_the_scale_metric(folder: Path, clip: SyntheticClip) 
     # What the user knows comes first.
     known = annotator.annotate(folder, scale_from="path=7")
     assert known.trajectory_length == pytest.approx(7)
+
+
+def test_video_depth_is_aligned_where_the_preset_has_it(
+    folder: Path, clip: SyntheticClip, relative: Annotation
+) -> None:
+    video = DistortedVideoDepth(
+        open_source(folder), clip.depth, "z", (96, 72), Distortion(), window_frames=8, overlap_frames=3
+    )
+    register_depth("test.video", lambda device: DepthFamily(video=video, completion=NearestCompletion()))
+    annotation = Annotator(replace(resolve("classical"), depth="test.video")).annotate(folder)
+    assert annotation.world_from_cam.tobytes() == relative.world_from_cam.tobytes()
+    frames = list(annotation.dense())
+    assert [frame.index for frame in frames] == list(range(20))
+    scale = depth_ratio(relative, clip)
+    level = [np.median(np.log(frame.depth / clip.depth[frame.index])) - math.log(scale) for frame in frames]
+    # The scale of the poses, without a jump: a small picture leaves the map a few per cent.
+    assert np.abs(level).max() < 0.06
+    assert np.abs(np.diff(level)).max() < 0.02
+    # It is the geometry of the map, as stereo sees it too.
+    stereo = next(iter(relative.dense()))
+    sure = stereo.confidence > 0.3
+    assert np.median(np.abs(frames[0].depth / stereo.depth - 1)[sure]) < 0.05
+    assert np.median(frames[0].confidence) > 0.3
+    assert annotation.timings_s["depth"] > 0
 
 
 def test_depth_providers_have_names() -> None:

@@ -13,6 +13,7 @@ import numpy as np
 import torch
 
 from vipe_core.annotation import Annotation, DenseFrame, Progress, ProgressCallback, Provenance
+from vipe_core.depth.aligned import AlignedDepth
 from vipe_core.depth.known import KnownLength
 from vipe_core.depth.stream import DenseDepth
 from vipe_core.depth.types import SceneMap
@@ -121,7 +122,7 @@ class Annotator:
             depth_kind="z",
             quality=quality,
             provenance=self._provenance(source, scaled),
-            dense=lambda: self._dense(source, scaled.scene, timings, report),
+            dense=lambda: self._dense(source, scaled, timings, report),
             timings_s=timings,
         )
 
@@ -151,15 +152,15 @@ class Annotator:
     def _dense(
         self,
         source: FrameSource,
-        scene: SceneMap,
+        scaled: ScaledScene,
         timings: dict[str, float],
         report: _Reporter,
     ) -> Generator[DenseFrame, None, None]:
         """Depth and mask of every frame in order; the time spent here, not in the consumer, is added to `timings`."""
-        total = len(scene.world_from_cam)
+        total = len(scaled.scene.world_from_cam)
         spent_s = 0.0
         with _typed_errors(source, report):
-            stream = DenseDepth(self.preset.dense_depth).stream(source, scene)
+            stream = self._depth_stage(scaled).stream(source, scaled.scene)
         with closing(stream) as frames:
             while True:
                 start_s = time.perf_counter()
@@ -172,6 +173,12 @@ class Annotator:
                 mask = frame.moving.astype(np.uint8)
                 yield DenseFrame(frame.index, frame.rgb, frame.depth, frame.confidence, mask, frame.kind)
                 report("depth", frame.index + 1, total)
+
+    def _depth_stage(self, scaled: ScaledScene) -> AlignedDepth | DenseDepth:
+        """Video depth aligned to the map where the preset has it, multi-view stereo elsewhere."""
+        if self._depth.video is None:
+            return DenseDepth(self.preset.dense_depth)
+        return AlignedDepth(self._depth, self.preset.alignment, metres=scaled.scale == "metric")
 
 
 class _Reporter:

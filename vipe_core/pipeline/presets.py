@@ -7,6 +7,7 @@ import hashlib
 import json
 from dataclasses import dataclass, field
 
+from vipe_core.depth.alignment import AlignmentSettings
 from vipe_core.depth.types import DepthSettings
 from vipe_core.errors import ConfigError
 from vipe_core.slam.settings import SlamSettings
@@ -24,9 +25,10 @@ class Preset:
         matcher: Provider of dense matching.
         sparse: Provider of sparse tracks.
         intrinsics: Provider of the initial camera.
-        depth: Provider of dense depth.
+        depth: Providers of dense depth, a name of `providers.py`.
         slam: Settings of the SLAM stage.
-        dense_depth: Settings of the depth stage.
+        dense_depth: Settings of the depth stage where depth is multi-view stereo.
+        alignment: Settings of the depth stage where the depth providers have video depth.
     """
 
     name: str
@@ -37,6 +39,7 @@ class Preset:
     depth: str
     slam: SlamSettings = field(default_factory=SlamSettings)
     dense_depth: DepthSettings = field(default_factory=DepthSettings)
+    alignment: AlignmentSettings = field(default_factory=AlignmentSettings)
 
     def canonical_json(self) -> str:
         """All fields, keys sorted, no white space: equal presets give equal text."""
