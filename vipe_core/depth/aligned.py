@@ -6,7 +6,8 @@ pictures go out with the depth. Between them wait the frames of a window and tho
 
 from __future__ import annotations
 
-from collections import deque
+import logging
+from collections import Counter, deque
 from collections.abc import Generator, Iterator
 from contextlib import closing
 from dataclasses import dataclass
@@ -29,6 +30,8 @@ from vipe_core.slam.segmentation import segment
 from vipe_core.video.source import Frame, FrameSource
 
 Array = NDArray[Any]
+
+logger = logging.getLogger(__name__)
 
 # Depth ends at so many times the typical one.
 _FAR = 1000.0
@@ -98,11 +101,13 @@ class AlignedDepth:
         """The frames of one shot with their (alpha, beta) and the relative standard deviation of the scale."""
         track = AffineTrack(self._settings.drift_ratio)
         queue: deque[_Waiting] = deque()
+        regimes: Counter[str] = Counter()
         for frame, video in stitched(self._video, frames):
             anchors = finder.of(frame, video)
             start = track.predicted(video, median)
             measurement = measure(anchors.samples, start)
             track.add(start, measurement, median)
+            regimes["nothing" if measurement is None else measurement.regime] += 1
             queue.append(_Waiting(frame.index, video, anchors, measurement))
             if len(queue) > self._settings.lag_frames:
                 yield queue.popleft(), *track.smoothed_first()
@@ -110,6 +115,7 @@ class AlignedDepth:
         while queue:
             yield queue.popleft(), *track.smoothed_first()
             track.drop_first()
+        logger.info("frames that tell of scale and shift, of one number, of nothing: %s", dict(regimes))
 
     def _finish(
         self,

@@ -18,7 +18,7 @@ from vipe_core.depth.robust import MAD_TO_SIGMA, weighted_median
 
 Array = NDArray[Any]
 Affine = tuple[float, float]
-Regime = Literal["affine", "scale", "held"]
+Regime = Literal["affine", "scale"]
 
 _SEED, _HYPOTHESES, _JUDGES = 17, 200, 1500
 # Relative errors: at which a sample is half lost to a hypothesis, and the least and most that are taken for noise.

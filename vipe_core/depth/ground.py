@@ -95,7 +95,6 @@ def scale_from_height(scene: SceneMap, shot: tuple[int, int], height_m: float) -
     if (np.abs(values - centre) < 2 * _AGREE).mean() < 0.5:
         raise ScaleUnobservable(f"parts of the video disagree about the ground below the camera; {elsewhere}")
     estimate = scale_from_ratios(ratios, _SHARED_SIGMA)
-    estimate = scale_from_ratios(ratios)
     if estimate is None:
         raise ScaleUnobservable(f"no ground is seen below the camera; {elsewhere}")
     return estimate

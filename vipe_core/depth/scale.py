@@ -237,11 +237,9 @@ def scale_from_baseline(
     a, b = (np.asarray(world_from_cam[name], np.float64).reshape(-1, 4, 4)[:, :3, 3] for name in (first, second))
     distance = np.linalg.norm(a - b, axis=1)
     seen = distance[np.isfinite(distance) & (distance > 0)]
-    if not len(seen):
+    found = scale_from_ratios([FrameRatio(math.log(baseline_m / value), 0.0, 1.0) for value in seen])
+    if found is None:
         raise ScaleUnobservable(f"the cameras {first!r} and {second!r} are at the same place, which tells no scale")
-    ratios = [FrameRatio(math.log(baseline_m / value), 0.0, 1.0) for value in seen]
-    found = scale_from_ratios(ratios)
-    assert found is not None
     return found
 
 

@@ -100,7 +100,7 @@ class Annotator:
         with _typed_errors(source, report), torch.inference_mode():
             result = slam.run(source, report)
             quality = assess(result, self.preset.slam, source.info.width)
-            scaled = set_scale(_scene(result), source, known, self._depth.metric, report)
+            scaled = set_scale(scene_of(result), source, known, self._depth.metric, report)
             quality = dataclasses.replace(quality, scale_sigma_ratio=scaled.sigma_ratio)
         timings = dict(result.timings_s)
         logger.info(
@@ -215,7 +215,7 @@ def _typed_errors(source: FrameSource, report: _Reporter) -> Iterator[None]:
         ) from error
 
 
-def _scene(result: SlamResult) -> SceneMap:
+def scene_of(result: SlamResult) -> SceneMap:
     """What the depth stage takes from the SLAM stage; moving cells are not to be trusted."""
     shape = (len(result.keyframes), result.grid.height, result.grid.width)
     return SceneMap(

@@ -192,7 +192,7 @@ class VideoDepth(Protocol):
 
     @property
     def overlap_frames(self) -> int:
-        """How many of them should be those that the call before ended with: fewer than half of a window, at least 2."""
+        """How many of them should be those that the call before ended with: at least 2, fewer than a window."""
 
     def input_size(self, width: int, height: int) -> tuple[int, int]:
         """(width, height) at which a video of that size is best given."""
