@@ -9,7 +9,7 @@ from typing import Annotated, ParamSpec, TypeVar
 
 import typer
 
-from services.cli import annotate, data, demo, evaluate, export, jobs, serve
+from services.cli import annotate, data, demo, evaluate, export, gallery, jobs, serve
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -77,6 +77,7 @@ _COMMANDS: dict[str, Callable[..., None]] = {
     "verify": data.verify,
     "unpack": data.unpack,
     "export": export.export,
+    "gallery": gallery.gallery,
 }
 for _name, _command in _COMMANDS.items():
     app.command(_name)(_typed_errors(_command))

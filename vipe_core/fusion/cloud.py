@@ -22,6 +22,8 @@ Array = NDArray[Any]
 
 # A patch seen under more than 80 degrees is an edge between two objects, or too slanted to be measured.
 MIN_COSINE = 0.17
+# Length of the mean normal of a voxel: 1 on a plane, 0.7 on an edge between two.
+_COHERENT = 0.6
 # What another frame measures must lie this much further away before a point counts as looked through.
 _THROUGH = 0.06
 
@@ -113,9 +115,14 @@ class CloudFuser:
         self._frames += 1
 
     def cloud(self, *, min_frames: int = 1) -> PointCloud:
-        """The points that at least `min_frames` frames saw (fewer, where there were fewer), in order of first sight."""
+        """The points that at least `min_frames` frames saw (fewer, where there were fewer), in order of first sight.
+
+        Voxels whose pixels do not agree on which way the surface faces are left out: there is none.
+        """
         used = self._used
+        normals = self._sums[:used, 7:10]
         keep = self._seen[:used, 1] >= min(min_frames, max(1, self._frames))
+        keep &= np.linalg.norm(normals, axis=1) >= _COHERENT * self._sums[:used, 0]
         sums = self._sums[:used][keep].astype(np.float64)
         weight = sums[:, :1]
         points = (self._cells[:used][keep] + sums[:, 1:4] / weight) * self.voxel

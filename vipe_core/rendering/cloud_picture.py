@@ -19,7 +19,7 @@ Canvas = NDArray[np.uint8]
 
 _SUPERSAMPLING = 2
 _BACKGROUND = ((38.0, 43.0, 52.0), (14.0, 16.0, 20.0))  # in the middle, in the corners
-_DISC_VOXELS = 1.15  # radius of a disc: reaches the points of the next voxels
+_DISC_VOXELS = 1.0  # radius of a disc: discs of neighbouring voxels overlap by half
 # Colours of the path from its start to its end.
 _PATH = np.array([(255, 190, 60), (240, 80, 110), (150, 95, 255)], np.float64)
 
@@ -112,10 +112,10 @@ def _background(height: int, width: int) -> NDArray[np.float32]:
 
 def _clay(normals: Array, world_from_cam: Array) -> Canvas:
     """Light from above the viewer's left shoulder, and a little from everywhere."""
-    light = world_from_cam[:3, :3] @ np.array([-0.45, -0.65, -0.61])
+    light = world_from_cam[:3, :3] @ np.array([-0.35, -0.35, -0.87])
     lit = np.clip(normals @ light, 0, 1)[:, None]
     around = (0.5 - 0.5 * (normals @ world_from_cam[:3, 1]))[:, None]
-    shade = 0.28 + 0.2 * around + 0.6 * lit
+    shade = 0.2 + 0.25 * around + 0.6 * lit
     return np.asarray(np.clip(shade * np.array([226.0, 220.0, 210.0]), 0, 255), np.uint8)
 
 

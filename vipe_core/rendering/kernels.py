@@ -73,23 +73,32 @@ def draw_surfels(
             y0, y1 = max(0, math.ceil(v - size)), min(h - 1, math.floor(v + size))
             plane = abs(along) > _MIN_SLANT and size > 1.5
             offset = nx * x + ny * y + nz * z
-            reach = size * z / focal
+            # On the plane of the disc, inverse depth is linear in the pixel.
+            by_col, by_row, first = 0.0, 0.0, 1.0 / z
+            if plane:
+                by_col, by_row = nx / (focal * offset), ny / (focal * offset)
+                first = nz / offset - by_col * cx - by_row * cy
+            reach = 1.0 / (size * z / focal) ** 2
+            flat = 1.0 / (size * size)
             for row in range(y0, y1 + 1):
+                ry = (row - cy) / focal
                 for col in range(x0, x1 + 1):
                     at = z
                     if plane:
-                        rx, ry = (col - cx) / focal, (row - cy) / focal
-                        at = offset / (nx * rx + ny * ry + nz)
-                        ex, ey, ez = at * rx - x, at * ry - y, at - z
-                        share = (ex * ex + ey * ey + ez * ez) / (reach * reach)
+                        inverse = first + by_col * col + by_row * row
+                        if inverse * near >= 1 or inverse <= 0:
+                            continue
+                        at = 1.0 / inverse
+                        ex, ey, ez = at * (col - cx) / focal - x, at * ry - y, at - z
+                        share = (ex * ex + ey * ey + ez * ez) * reach
                     else:
-                        share = ((col - u) * (col - u) + (row - v) * (row - v)) / (size * size)
-                    if share > 1 or at <= near:
+                        share = ((col - u) * (col - u) + (row - v) * (row - v)) * flat
+                    if share > 1:
                         continue
                     if turn == 0:
                         depth[row, col] = min(depth[row, col], at)
                     elif at < depth[row, col] + 1.5 * radius:
-                        gain = math.exp(-3 * share) + 1e-4
+                        gain = (1.001 - share) * (1.001 - share)
                         for c in range(3):
                             total[row, col, c] += gain * colours[n, c]
                         total[row, col, 3] += gain
@@ -100,20 +109,29 @@ def eye_dome(depth: Array, reach: int, strength: float) -> Array:
     """(h, w) float32 factor in 0..1: dark beside what is nearer (Boucheny 2009). 1 on the background."""
     h, w = depth.shape
     out = np.ones((h, w), np.float32)
+    logs = np.empty((h, w), np.float32)
     for y in range(h):
         for x in range(w):
-            if not depth[y, x] < FAR:
+            logs[y, x] = math.log(depth[y, x]) if depth[y, x] < FAR else FAR
+    rows, cols = np.empty(16, np.int64), np.empty(16, np.int64)
+    for k in range(16):
+        angle = 0.25 * math.pi * (k % 8)
+        rows[k] = round((1 + k // 8) * reach * math.sin(angle))
+        cols[k] = round((1 + k // 8) * reach * math.cos(angle))
+    for y in range(h):
+        for x in range(w):
+            here = logs[y, x]
+            if not here < FAR:
                 continue
-            here = math.log(depth[y, x])
             total = 0.0
-            for k in range(8):
-                angle = 0.25 * math.pi * k
-                for step in range(1, 3):
-                    row = y + round(step * reach * math.sin(angle))
-                    col = x + round(step * reach * math.cos(angle))
-                    if row < 0 or col < 0 or row >= h or col >= w or not depth[row, col] < FAR:
-                        continue
-                    total += min(0.08, max(0.0, here - math.log(depth[row, col]))) / step
+            for k in range(16):
+                row, col = y + rows[k], x + cols[k]
+                if row < 0 or col < 0 or row >= h or col >= w:
+                    continue
+                # The background is infinitely far and adds nothing.
+                nearer = min(np.float32(0.08), here - logs[row, col])
+                if nearer > 0:
+                    total += nearer if k < 8 else 0.5 * nearer
             out[y, x] = math.exp(-strength * total / 12)
     return out
 
