@@ -112,6 +112,23 @@ def test_the_stage_is_in_the_picture_and_upright(azimuth: float, elevation: floa
     assert (ahead & (px >= 0).all(axis=1) & (px[:, 0] < viewer.width) & (px[:, 1] < viewer.height)).all()
 
 
+def test_up_is_across_the_floor_however_the_cameras_are_held() -> None:
+    camera = Camera.pinhole_from_fov(70.0, 160, 120)
+    angle = np.radians(25.0)
+    down, rolled = np.eye(4), np.eye(4)
+    down[1:3, 1:3] = [[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]]
+    rolled[:2, :2] = [[np.cos(0.15), -np.sin(0.15)], [np.sin(0.15), np.cos(0.15)]]
+    poses = np.stack([pose @ down @ rolled for pose in POSES])
+    fuser = CloudFuser(camera, "z", 0.03)
+    for pose in poses:
+        fuser.add(view(camera, pose))
+    stage = Stage.of(fuser.cloud(), poses)
+    assert np.degrees(np.arccos(stage.axes[1] @ [0, -1, 0])) < 0.5
+    azimuth, elevation = stage.best(VIEWER)
+    assert 0 < elevation < 45
+    assert abs(azimuth) <= 40
+
+
 def test_far_background_is_not_framed() -> None:
     near = board(2.0, (9, 9, 9))
     far = board(60.0, (9, 9, 9), half=20.0)

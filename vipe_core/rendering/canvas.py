@@ -73,7 +73,7 @@ def save(picture: Canvas, out: Path, *, quality: int = 90) -> Path:
     return out
 
 
-def save_animation(pictures: Sequence[Canvas], out: Path, *, fps: float, quality: int = 60) -> Path:
+def save_animation(pictures: Sequence[Canvas], out: Path, *, fps: float, quality: int = 48) -> Path:
     """Write an animated `.webp` that runs for ever."""
     film = cv2.Animation()
     film.frames = [np.ascontiguousarray(picture[..., ::-1]) for picture in pictures]

@@ -38,9 +38,8 @@ _FOV_DEG = 42.0
 _COLUMNS = 4
 _TILE_PX = 320
 _FILM_FPS = 20.0
-_ELEVATION_DEG = 24.0
 _ZOOM = 1.04
-_FRUSTUM = 0.07  # of the extent of the scene
+_FRUSTUM = 0.055  # of the extent of the scene
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,7 +58,7 @@ class GallerySizes:
     film: tuple[int, int] = (640, 448)
     film_frames: int = 72
     animation_width: int = 400
-    animation_step: int = 2
+    animation_step: int = 3
 
 
 def write_gallery(
@@ -125,12 +124,13 @@ class _Gallery:
         width, height = self._sizes.still
         viewer = Camera.pinhole_from_fov(_FOV_DEG, width, height)
         stage = self._stage
-        main_deg, turn_deg = (0.0, 120.0) if stage.all_around else (12.0, 24.0)
-        main = stage.around(main_deg, _ELEVATION_DEG, viewer, zoom=_ZOOM)
+        azimuth, elevation = stage.best(viewer)
+        turn_deg = 120.0 if stage.all_around else 30.0
+        main = stage.around(azimuth, elevation, viewer, zoom=_ZOOM)
         views = {
             "cloud.jpg": main,
-            "cloud_left.jpg": stage.around(main_deg + turn_deg, 14.0, viewer, zoom=_ZOOM),
-            "cloud_right.jpg": stage.around(main_deg - 2 * turn_deg, 16.0, viewer, zoom=_ZOOM),
+            "cloud_left.jpg": stage.around(azimuth + turn_deg, elevation, viewer, zoom=_ZOOM),
+            "cloud_right.jpg": stage.around(azimuth - turn_deg, elevation, viewer, zoom=_ZOOM),
             "cloud_above.jpg": stage.around(0.0, 68.0, viewer),
         }
         drawn = {name: self._drawn(pose, viewer) for name, pose in views.items()}
@@ -156,7 +156,7 @@ class _Gallery:
     def _film(self) -> None:
         sizes = self._sizes
         viewer = Camera.pinhole_from_fov(_FOV_DEG, *sizes.film)
-        poses = self._stage.turntable(sizes.film_frames, _ELEVATION_DEG, viewer, zoom=_ZOOM)
+        poses = self._stage.turntable(sizes.film_frames, *self._stage.best(viewer), viewer, zoom=_ZOOM)
         small: list[Canvas] = []
         with VideoWriter(self.path("turn.mp4"), _FILM_FPS, crf=18) as film:
             for k, pose in enumerate(poses):
