@@ -207,7 +207,7 @@ def _scores(done: list[dict[str, Any]], samples: dict[Path, Path], output: Path)
         artifacts = read_artifacts(output / "artifacts", row["key"])
         truth_path = samples.get(Path(row["uri"]))
         truth = read_truth(truth_path) if truth_path else None
-        artifact_sheet(artifacts, output / "pictures" / f"{row['key']}.png", truth=truth, title=Path(row["uri"]).name)
+        artifact_sheet(artifacts, output / "pictures" / f"{row['key']}.png", truth=truth)
         if truth is None:
             continue
         errors = evaluate_artifacts(artifacts, truth)
@@ -220,12 +220,13 @@ def _say_what_next(console: Console, output: Path) -> None:
     here, vipectl = _near(output), _near(Path(sys.executable).parent / "vipectl")
     lines = (
         ("Look at the result:", ""),
-        (f"  {here}/pictures/", "frames, depth and camera path of each video in one PNG"),
+        (f"  {here}/pictures/", "frames, depth, points and camera path of each video in one PNG"),
         (f"  {here}/artifacts/", "pose/ intrinsics/ depth/ rgb/ mask/, as nvidia-vipe lays them out"),
         (f"  {here}/dataset/", "webdataset tars, meta.parquet, failures.parquet, dataset.json"),
         ("Go on:", ""),
         (f"  {vipectl} verify {here}/dataset --deep", ""),
         (f"  {vipectl} export {here}/dataset {here}/npz --format npz", ""),
+        (f"  {vipectl} gallery {here}/dataset {here}/gallery", "ten pictures and two films of each video"),
         (f"  {vipectl} annotate YOUR_VIDEO.mp4 -o vipe_output/mine", ""),
         (f"  {vipectl} up", "the service on http://127.0.0.1:8080, until Ctrl-C"),
     )

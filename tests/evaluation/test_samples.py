@@ -6,15 +6,13 @@ from dataclasses import replace
 from pathlib import Path
 
 import av
-import cv2
 import numpy as np
 import pytest
 
 from vipe_core.errors import ConfigError, FormatError
 from vipe_core.evaluation import samples
 from vipe_core.evaluation.metrics import depth_errors, sample_depth
-from vipe_core.evaluation.picture import contact_sheet
-from vipe_core.evaluation.synthetic import render_frames, tiny_clip
+from vipe_core.evaluation.synthetic import render_frames
 from vipe_core.evaluation.synthetic.crowd import CROWD_FPS, MAX_MOVING, MIN_MOVING, crowd, moving_share
 from vipe_core.evaluation.truth import evaluate_static_guess, read_truth
 
@@ -121,29 +119,3 @@ def test_the_trivial_answer_has_the_errors_it_must_have(tmp_path: Path) -> None:
     assert report.trajectory.ate_rmse == pytest.approx(np.sqrt(truth.world_from_cam[:, :3, 3].var(axis=0).sum()))
     assert report.depth is not None
     assert report.depth.abs_rel > 0.2
-
-
-def test_contact_sheet(tmp_path: Path) -> None:
-    clip = tiny_clip("orbit", num_frames=4, width=96, height=72)
-    half = clip.world_from_cam.copy()
-    half[:, :3, 3] *= 0.5
-    out = contact_sheet(
-        list(clip.rgb),
-        list(clip.depth / 2),
-        half,
-        tmp_path / "deep" / "sheet.png",
-        gt_world_from_cam=clip.world_from_cam,
-        title="orbit",
-        camera=clip.camera,
-    )
-    picture = cv2.imread(str(out))
-    assert picture is not None
-    assert picture.shape[1] > 1200
-    plain = contact_sheet(list(clip.rgb), list(clip.depth), half, tmp_path / "plain.png")
-    assert (cv2.imread(str(plain)) != picture).mean() > 0.01
-    missing = contact_sheet(list(clip.rgb), [np.zeros((72, 96), np.float32)] * 4, half, tmp_path / "none.png")
-    assert missing.stat().st_size > 1000
-    with pytest.raises(ConfigError, match="as many depth maps"):
-        contact_sheet(list(clip.rgb), [], half, tmp_path / "x.png")
-    with pytest.raises(ConfigError, match="frame_index"):
-        contact_sheet(list(clip.rgb), list(clip.depth), half, tmp_path / "x.png", frame_index=[0, 1, 2, 9])

@@ -78,13 +78,13 @@ def test_a_path_is_hidden_behind_surfaces() -> None:
     poses[:, 0, 3], poses[:, 2, 3] = np.linspace(-0.8, 0.8, 9), 3.0
     cloud = board(2.0, (90, 90, 90), half=0.25)
     path = Path3D(poses, VIEWER, frustum=0.02, num_frusta=2)
-    with_path = render_cloud(cloud, FRONT, VIEWER, path=path).astype(int)
+    with_path = render_cloud(cloud, FRONT, VIEWER, paths=[path]).astype(int)
     without = render_cloud(cloud, FRONT, VIEWER).astype(int)
     change = np.abs(with_path - without).sum(axis=-1)
     middle, beside = change[36, 44:53].max(), change[36, 62:70].max()
     assert beside > 150
     assert 0 < middle < 0.6 * beside
-    partly = render_cloud(cloud, FRONT, VIEWER, path=Path3D(poses, VIEWER, 0.02, 2, upto=1)).astype(int)
+    partly = render_cloud(cloud, FRONT, VIEWER, paths=[Path3D(poses, VIEWER, 0.02, 2, upto=1)]).astype(int)
     assert np.abs(partly - without).sum(axis=-1)[36, 60:].max() == 0
     assert path_colour(0.0) != path_colour(1.0)
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from vipe_core.annotation import MOVING
+from vipe_core.annotation import MEASURED, MOVING
 from vipe_core.errors import FormatError
 from vipe_core.formats.reading import Artifacts
 from vipe_core.fusion import SurfaceView, surface_weight
@@ -45,7 +45,10 @@ class ArtifactFrame:
 
     def view(self, artifacts: Artifacts, min_confidence: float = 0.0) -> SurfaceView:
         """The frame as fusion takes it: what moves and what nobody measured stays out."""
-        weight = surface_weight(self.depth, confidence=self.confidence, mask=self.moving, min_confidence=min_confidence)
+        out = self.moving
+        if self.kind is not None:
+            out = self.kind != MEASURED if out is None else out | (self.kind != MEASURED)
+        weight = surface_weight(self.depth, confidence=self.confidence, mask=out, min_confidence=min_confidence)
         return SurfaceView(artifacts.world_from_cam[self.index], self.rgb, self.depth, weight)
 
 

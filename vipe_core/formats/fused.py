@@ -12,7 +12,7 @@ from vipe_core.formats.frames import read_frames, spread
 from vipe_core.formats.reading import Artifacts
 from vipe_core.fusion import CloudFuser, Mesh, PointCloud, TsdfVolume
 
-MIN_CONFIDENCE = 0.2
+MIN_CONFIDENCE = 0.1
 # A voxel as a share of the median depth, so that a room is about half a million points whatever its scale; and in
 # pixels: what one covers at that depth, and a margin.
 _CLOUD_SHARE = 1 / 250

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -32,8 +33,10 @@ class Path3D:
         world_from_cam: (N, 4, 4).
         camera: Gives the frusta their shape.
         frustum: Their length in units of the world.
-        num_frusta: How many along the path.
+        num_frusta: How many along the path; 0 for none.
         upto: Draw the path to this index only, with a frustum there; all of it if None.
+        colour: One for all of it; from amber to violet if None.
+        width: Of the lines, 1 is usual.
     """
 
     world_from_cam: NDArray[np.float64]
@@ -41,6 +44,13 @@ class Path3D:
     frustum: float
     num_frusta: int = 7
     upto: int | None = None
+    colour: tuple[float, float, float] | None = None
+    width: float = 1.0
+
+    def colour_at(self, index: float) -> Array:
+        """Colour of the path at an index of its poses."""
+        share = index / max(1, len(self.world_from_cam) - 1)
+        return np.array(self.colour if self.colour is not None else path_colour(share))
 
 
 def render_cloud(
@@ -48,7 +58,7 @@ def render_cloud(
     world_from_cam: Array,
     camera: Camera,
     *,
-    path: Path3D | None = None,
+    paths: Sequence[Path3D] = (),
     back_faces: bool = False,
     clay: bool = False,
 ) -> Canvas:
@@ -57,7 +67,7 @@ def render_cloud(
     Args:
         world_from_cam: (4, 4) pose of the viewer.
         camera: Of the viewer, pinhole with square pixels.
-        path: Drawn with the depth test: dim behind surfaces.
+        paths: Drawn in this order with the depth test: dim behind surfaces.
         back_faces: Whether to draw surfaces from behind. Without, one looks into a room through its walls.
         clay: In one colour, lit from above the viewer, instead of in the colours of the frames.
     """
@@ -88,7 +98,7 @@ def render_cloud(
     hit = total[..., 3] > 0
     image[hit] = total[hit][:, :3] / total[hit][:, 3:]
     image *= eye_dome(depth, scale, 30.0 if not clay else 40.0)[..., None]
-    if path is not None:
+    for path in paths:
         _draw_path(image, depth, path, cam_from_world, focal, cx, cy, near)
     small = cv2.resize(image, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
     return np.asarray(np.clip(np.rint(small), 0, 255), np.uint8)
@@ -126,22 +136,24 @@ def _draw_path(
     count = len(poses)
     last = count - 1 if path.upto is None else path.upto
     local = poses[:, :3, 3] @ cam_from_world[:3, :3].T + cam_from_world[:3, 3]
-    width = max(1.0, image.shape[1] / 900)
+    width = path.width * max(1.0, image.shape[1] / 900)
 
     def stroke(segments: list[tuple[Array, Array, Array]], radius: float, hidden: float) -> None:
         drawn = np.zeros(depth.shape, np.float32)
         for start, end, colour in segments:
             draw_line(start, end, colour, radius, hidden, focal, cx, cy, near, depth, image, drawn)
 
-    line = [(local[k], local[k + 1], np.array(path_colour((k + 0.5) / max(1, count - 1)))) for k in range(last)]
+    line = [(local[k], local[k + 1], path.colour_at(k + 0.5)) for k in range(last)]
     dark = np.zeros(3)
     stroke([(a, b, dark) for a, b, _ in line], 2.6 * width, 0.12)
     stroke(line, 1.5 * width, 0.35)
+    if path.num_frusta == 0:
+        return
     shown = set(np.unique(np.linspace(0, last, min(path.num_frusta, last + 1)).round().astype(int)).tolist())
     edges = _frustum_edges(path.camera, path.frustum)
     for k in sorted(shown | {last}):
         pose = cam_from_world @ poses[k]
-        colour = np.array(path_colour(k / max(1, count - 1)))
+        colour = path.colour_at(k)
         lines = [(a @ pose[:3, :3].T + pose[:3, 3], b @ pose[:3, :3].T + pose[:3, 3], colour) for a, b in edges]
         current = k == last
         stroke([(a, b, dark) for a, b, _ in lines], (2.2 if current else 1.7) * width, 0.1)

@@ -89,7 +89,8 @@ class Stage:
         """Azimuth and elevation of the view that shows most: whose picture is covered most by surfaces that face it."""
         azimuths = range(-180, 180, 30) if self.all_around else range(-40, 41, 10)
         return max(
-            ((float(a), float(e)) for e in (24, 32) for a in azimuths), key=lambda view: self._shown(*view, camera)
+            ((float(a), float(e)) for e in (24, 32) for a in azimuths),
+            key=lambda view: self._shown(view[0], view[1], camera),
         )
 
     def turntable(
