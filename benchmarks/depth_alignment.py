@@ -39,13 +39,13 @@ from vipe_core.depth.alignment import Samples, measure
 from vipe_core.depth.anchors import AnchorFinder
 from vipe_core.depth.known import KnownLength
 from vipe_core.depth.scale import normalised
+from vipe_core.depth.scene import scene_of
 from vipe_core.depth.types import SceneMap
 from vipe_core.depth.windows import stitched
 from vipe_core.errors import FormatError, ScaleUnobservable, VipeError
 from vipe_core.evaluation.synthetic.depth_models import DistortedVideoDepth, Distortion, NoisyMetricDepth
 from vipe_core.evaluation.truth import GroundTruth, read_truth
 from vipe_core.geometry import umeyama
-from vipe_core.pipeline.annotator import scene_of
 from vipe_core.pipeline.presets import resolve
 from vipe_core.pipeline.scaling import set_scale
 from vipe_core.priors.classical import classical_priors

@@ -157,7 +157,7 @@ class DenseFrame:
         index: Frame index, 0..N-1.
         rgb: (H, W, 3) uint8, upright, at source resolution.
         depth: (H, W) float32 in units of the trajectory; 0 where there is no value.
-        confidence: (H, W) float32 in 0..1: 0 is a value that was filled in, not measured.
+        confidence: (H, W) float32 in 0..1; what is filled in, not measured, has 0.05 at most, what moves 0.
         mask: (H, W) uint8 instance ids, `MASK_PHRASES` says of what; 0 is the static background.
         kind: (H, W) uint8, where the depth comes from: `MEASURED`, `FILLED`, `SKY`, `MOVING` or `UNOBSERVED`.
     """

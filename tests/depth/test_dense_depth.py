@@ -109,6 +109,14 @@ def test_depth_does_not_need_good_keyframe_maps(sideways: SyntheticClip) -> None
     assert np.median(errors) < 0.015
 
 
+def test_the_fast_setting_is_nearly_as_good(sideways: SyntheticClip) -> None:
+    settings = dataclasses.replace(DepthSettings.fast(), window_frames=20)
+    stream = DenseDepth(settings).stream(ClipSource(sideways.rgb), scene_of(sideways))
+    errors = np.stack([relative_error(frame, sideways) for frame in stream])
+    assert errors.mean() < 0.05
+    assert np.median(errors) < 0.015
+
+
 def test_forward_motion() -> None:
     clip = tiny_clip("forward", num_frames=14)
     errors = np.stack([relative_error(f, clip) for f in run(clip, scene_of(clip))])

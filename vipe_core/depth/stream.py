@@ -30,8 +30,8 @@ from vipe_core.video.source import Frame, FrameSource
 
 Array = NDArray[Any]
 
-# Weight of what bundle adjustment is sure of, beside 1 of a sure measurement.
-_HINT = 0.003
+# Weight of what bundle adjustment is sure of, beside 1 of a sure measurement; less sure is worth far less.
+_HINT, _HINT_POWER = 0.003, 8
 # Confidence of what is filled in right beside a measurement. It falls by a factor e over the first share of the width
 # of the picture, and nothing is known after so many times that.
 _FILL_CONFIDENCE = 0.05
@@ -153,7 +153,7 @@ class DenseDepth:
         measured = (found.belief > 0) & ~sky
         # Where nothing is measured, what bundle adjustment found is a hint.
         unknown = found.weight == 0
-        weight = np.where(unknown, np.where(picture.moving, 0, _HINT * prior_trust**2), found.weight)
+        weight = np.where(unknown, np.where(picture.moving, 0, _HINT * prior_trust**_HINT_POWER), found.weight)
         if not (weight[~sky] > 0).any():
             return prior_value, np.zeros_like(found.belief), np.full(sky.shape, UNOBSERVED, np.uint8)
         value = complete(

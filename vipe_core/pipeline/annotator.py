@@ -15,8 +15,8 @@ import torch
 from vipe_core.annotation import Annotation, DenseFrame, Progress, ProgressCallback, Provenance
 from vipe_core.depth.aligned import AlignedDepth
 from vipe_core.depth.known import KnownLength
+from vipe_core.depth.scene import scene_of
 from vipe_core.depth.stream import DenseDepth
-from vipe_core.depth.types import SceneMap
 from vipe_core.errors import EngineError, VipeError
 from vipe_core.pipeline.device import describe_device, resolve_device, set_threads
 from vipe_core.pipeline.presets import Preset, resolve
@@ -25,7 +25,7 @@ from vipe_core.pipeline.providers import open_depth
 from vipe_core.pipeline.scaling import ScaledScene, set_scale
 from vipe_core.priors.classical import classical_priors
 from vipe_core.quality import assess
-from vipe_core.slam.system import Slam, SlamResult
+from vipe_core.slam.system import Slam
 from vipe_core.video import MaskedView, open_source
 from vipe_core.video.source import FrameSource
 
@@ -213,20 +213,6 @@ def _typed_errors(source: FrameSource, report: _Reporter) -> Iterator[None]:
         raise EngineError(
             f"{source.info.name}: {type(error).__name__}: {first_line}; please report it with the log"
         ) from error
-
-
-def scene_of(result: SlamResult) -> SceneMap:
-    """What the depth stage takes from the SLAM stage; moving cells are not to be trusted."""
-    shape = (len(result.keyframes), result.grid.height, result.grid.width)
-    return SceneMap(
-        camera=result.camera,
-        world_from_cam=result.world_from_cam,
-        keyframes=result.keyframes,
-        inverse_depth=result.inverse_depth.reshape(shape),
-        confidence=np.where(result.static, result.map.confidence, np.float32(0)).reshape(shape),
-        cuts=result.cuts,
-        labels=result.trajectory.labels,
-    )
 
 
 def annotate(
