@@ -28,7 +28,7 @@ Array = NDArray[Any]
 # Of an edge of the picture, beside 1 of no edge: never cut off altogether.
 _LEAST_LINK = 1e-4
 # Of a difference between slopes, in pixels squared; and what holds slopes at zero: nothing is continued for ever.
-_STIFFNESS, _LEVELLING = 100.0, 3e-4
+_STIFFNESS, _LEVELLING = 100.0, 1e-4
 _SWEEPS = 8
 _COARSEST = 4
 _SOLUTIONS = 2

@@ -20,6 +20,7 @@ from vipe_core.ba.problem import Grid
 from vipe_core.depth.completion import complete
 from vipe_core.depth.consistency import Confirmed, confirm
 from vipe_core.depth.geometry import KeyframePrior, Prior, choose_sources, relative
+from vipe_core.depth.moving import stand
 from vipe_core.depth.sky import find_sky
 from vipe_core.depth.sweep import PlaneSweep, RawDepth
 from vipe_core.depth.types import FILLED, MEASURED, MOVING, SKY, UNOBSERVED, DepthFrame, DepthSettings, SceneMap
@@ -165,6 +166,7 @@ class DenseDepth:
             settings.fill_edge,
             settings.fill_tolerance,
         )
+        value = stand(value, picture.moving, measured)
         away_px = cv2.distanceTransform((~measured).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
         reach_px = _FILL_REACH * sky.shape[1]
         confidence = np.where(measured, found.belief, _FILL_CONFIDENCE * np.exp(-away_px / reach_px))
