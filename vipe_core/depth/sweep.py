@@ -109,9 +109,9 @@ class PlaneSweep:
         numbers = np.arange(len(planes), dtype=np.float32)
         position = np.interp(guess, planes, numbers).astype(np.float32)
         add_prior(cost, position, trust, settings.prior_gain, settings.prior_reach)
-        position_coarse, raw, margin = winner(self._aggregated(cost, gray), matching)
-        coarse = np.interp(position_coarse, numbers, planes).astype(np.float32)
-        reach = settings.fine_reach * np.interp(position_coarse, numbers, np.gradient(planes)).astype(np.float32)
+        plane, raw, margin = winner(self._aggregated(cost, gray), matching)
+        coarse = np.interp(plane, numbers, planes).astype(np.float32)
+        reach = settings.fine_reach * np.interp(plane, numbers, np.gradient(planes)).astype(np.float32)
 
         fine_gray = half.astype(np.float32)
         coarse = np.maximum(coarse, np.float32(0.05 * prior.low))
@@ -126,7 +126,7 @@ class PlaneSweep:
         sure = cv2.resize(margin, (width, height), interpolation=cv2.INTER_LINEAR)
         score = np.clip(1 - raw, 0, 1).astype(np.float32)
         # The nearest of all hypotheses wins where none is right.
-        at_end = (position_coarse > len(planes) - 2).astype(np.uint8)
+        at_end = (plane > len(planes) - 2).astype(np.uint8)
         score[cv2.resize(at_end, (width, height), interpolation=cv2.INTER_NEAREST) > 0] = 0
         return RawDepth(found, score, np.asarray(sure, np.float32), True)
 
