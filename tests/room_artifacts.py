@@ -30,10 +30,11 @@ def write_room(
     name: str = "room",
     scale: Scale = "metric",
     attributes: tuple[Attribute, ...] = ALL_ATTRIBUTES,
+    measured: bool = True,
 ) -> Artifacts:
-    """Write and read back."""
+    """Write and read back. Without `measured` the camera stands still and all depth is filled in."""
     camera = CAMERAS[model]
-    poses = np.stack(POSES)
+    poses = np.stack(POSES if measured else [POSES[0]] * len(POSES))
     count = len(poses)
 
     def dense() -> Iterator[DenseFrame]:
@@ -44,6 +45,8 @@ def write_room(
             mask = np.zeros(depth.shape, np.uint8)
             depth[MOVING_PATCH], mask[MOVING_PATCH], kind[MOVING_PATCH] = 0.7, 1, MOVING
             depth[FILLED_PATCH], confidence[FILLED_PATCH], kind[FILLED_PATCH] = 0.5, 0, FILLED
+            if not measured:
+                confidence[:], kind[:] = 0, FILLED
             yield DenseFrame(index, rgb, depth, confidence, mask, kind)
 
     annotation = Annotation(

@@ -158,6 +158,16 @@ def test_nerfstudio_has_opengl_axes_and_z_up(tmp_path: Path, model: str) -> None
         assert distance_to_surfaces((np.linalg.inv(applied) @ point)[None, :3])[0] < 0.01
 
 
+def test_nothing_measured_is_an_empty_export_and_no_error(tmp_path: Path) -> None:
+    artifacts = write_room(tmp_path, measured=False)
+    cloud, mesh = fuse_cloud(artifacts), fuse_mesh(artifacts)
+    assert len(cloud) == len(mesh.faces) == 0
+    assert plyfile.PlyData.read(write_ply(tmp_path / "c.ply", cloud))["vertex"].count == 0
+    assert plyfile.PlyData.read(write_ply(tmp_path / "m.ply", mesh))["face"].count == 0
+    assert (export_colmap(artifacts, tmp_path / "colmap") / "sparse/0/points3D.bin").stat().st_size == 8
+    assert (export_nerfstudio(artifacts, tmp_path / "ns") / "transforms.json").is_file()
+
+
 def test_what_a_format_cannot_hold_is_said(tmp_path: Path) -> None:
     artifacts = write_room(tmp_path, "mei")
     with pytest.raises(ExportUnsupported, match="mei") as error:

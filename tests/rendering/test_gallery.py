@@ -55,6 +55,14 @@ def test_a_sequence_of_the_original_tool_has_a_gallery_without_confidence(tmp_pa
     assert all(path.stat().st_size > 1000 for path in paths)
 
 
+def test_a_camera_that_stands_still_measures_nothing_and_has_pictures(tmp_path: Path) -> None:
+    artifacts = write_room(tmp_path, measured=False)
+    paths = write_gallery(artifacts, tmp_path / "g", sizes=SMALL)
+    sheet = cv2.imread(str(paths[PICTURES.index("frames.jpg")]))
+    assert sheet.std() > 12
+    assert all(path.stat().st_size > 0 for path in paths)
+
+
 def test_without_depth_there_is_nothing_to_draw(tmp_path: Path) -> None:
     artifacts = write_room(tmp_path, attributes=("pose", "intrinsics", "rgb"))
     with pytest.raises(FormatError, match="depth"):

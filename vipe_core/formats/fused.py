@@ -50,7 +50,7 @@ def fuse_cloud(
     *,
     voxel: float | None = None,
     min_confidence: float = MIN_CONFIDENCE,
-    max_points: int = 3_000_000,
+    max_points: int = 4_000_000,
     step: int = 1,
 ) -> PointCloud:
     """One cloud of all frames: what moves, what nobody measured, edges, and what other frames see through are left out.

@@ -62,7 +62,7 @@ class CloudFuser:
         max_points: Most voxels kept; about 60 bytes each.
     """
 
-    def __init__(self, camera: Camera, kind: DepthKind, voxel: float, *, max_points: int = 3_000_000) -> None:
+    def __init__(self, camera: Camera, kind: DepthKind, voxel: float, *, max_points: int = 4_000_000) -> None:
         if not voxel > 0 or max_points < 1:
             raise ValueError(f"a voxel needs a size and a cloud needs points, got {voxel} and {max_points}")
         self.voxel = float(voxel)
