@@ -22,6 +22,7 @@ from vipe_core.rendering.viewpoints import Stage, foreground
 FOV_DEG = 42.0
 ZOOM = 1.04
 _FRUSTUM = 0.055  # of the extent of the scene
+_MOST_FRUSTA = 7
 _TILE_PX = 320
 _GAP, _MARGIN = 6, 8
 _VIEW = (1000, 700)
@@ -61,7 +62,12 @@ def paths(
     artifacts: Artifacts, stage: Stage, *, truth: NDArray[np.float64] | None = None, upto: int | None = None
 ) -> list[Path3D]:
     """The camera path of a sequence as it is drawn on a stage, over the true one."""
-    drawn = [Path3D(artifacts.world_from_cam, artifacts.camera, _FRUSTUM * stage.extent, upto=upto)]
+    frustum = _FRUSTUM * stage.extent
+    eyes = artifacts.world_from_cam[:, :3, 3]
+    length = float(np.linalg.norm(np.diff(eyes, axis=0), axis=1).sum())
+    # As many as stand apart from each other.
+    number = min(_MOST_FRUSTA, 2 + int(length / (3 * frustum)))
+    drawn = [Path3D(artifacts.world_from_cam, artifacts.camera, frustum, num_frusta=number, upto=upto)]
     if truth is not None:
         white = (236, 240, 245)
         drawn.insert(0, Path3D(truth, artifacts.camera, 0.0, num_frusta=0, colour=white, width=2.2))
