@@ -9,7 +9,7 @@ import pytest
 from api_helpers import assert_problem, body, claim, finish, plan, submit
 
 from services.api import paging
-from services.domain.models import LeaseProgress
+from services.domain.models import JobSpec, LeaseProgress
 from services.store.sql import SqlStore
 
 
@@ -36,6 +36,14 @@ class TestCreate:
         assert job["spec"] == expected
         assert job["progress"]["frames_expected"] is None
         assert http.get(answer.headers["location"]).json() == job
+
+    def test_attributes_of_a_request_and_of_the_domain_agree(self, http: httpx.Client) -> None:
+        job = http.post("/v1/jobs", json=body()).json()
+        assert tuple(job["spec"]["attributes"]) == JobSpec(("/in",), "/out").attributes
+        assert "mask" in job["spec"]["attributes"]
+        assert "confidence" not in job["spec"]["attributes"]
+        asked = http.post("/v1/jobs", json=body(attributes=["confidence"])).json()
+        assert asked["spec"]["attributes"] == ["pose", "intrinsics", "confidence"]
 
     def test_times_are_rfc_3339_in_utc(self, http: httpx.Client) -> None:
         job = http.get(f"/v1/jobs/{submit(http)}").json()

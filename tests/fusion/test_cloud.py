@@ -133,3 +133,12 @@ def test_a_frame_of_another_size_is_refused() -> None:
         fuser.add(view(PINHOLE.resized(80, 60), POSES[0]))
     with pytest.raises(ValueError, match="voxel"):
         CloudFuser(PINHOLE, "z", 0.0)
+    with pytest.raises(ValueError, match="eight"):
+        CloudFuser(PINHOLE, "z", 0.1, max_points=7)
+
+
+def test_the_least_memory_still_ends() -> None:
+    fuser = CloudFuser(PINHOLE, "z", 0.01, max_points=8)
+    for pose in POSES[:3]:
+        fuser.add(view(PINHOLE, pose))
+    assert 0 < len(fuser) <= 8

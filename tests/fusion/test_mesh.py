@@ -93,6 +93,13 @@ def test_small_pieces_are_left_out(mesh: Mesh) -> None:
     assert len(volume.mesh(min_faces=10**9).faces) == len(volume.mesh(min_faces=10**9).vertices) == 0
 
 
+def test_the_least_memory_still_ends() -> None:
+    volume = TsdfVolume(PINHOLE, "z", 0.02, max_blocks=8)
+    for one in POSES[:2]:
+        volume.add(view(PINHOLE, one))
+    assert volume.voxel > 0.1
+
+
 def test_nothing_seen_is_an_empty_mesh() -> None:
     empty = TsdfVolume(PINHOLE, "z", VOXEL).mesh()
     assert empty.vertices.shape == empty.normals().shape == (0, 3)

@@ -63,8 +63,9 @@ class CloudFuser:
     """
 
     def __init__(self, camera: Camera, kind: DepthKind, voxel: float, *, max_points: int = 4_000_000) -> None:
-        if not voxel > 0 or max_points < 1:
-            raise ValueError(f"a voxel needs a size and a cloud needs points, got {voxel} and {max_points}")
+        # Voxels on different sides of the origin never merge: eight are the fewest.
+        if not voxel > 0 or max_points < 8:
+            raise ValueError(f"a voxel needs a size and a cloud at least eight points, got {voxel} and {max_points}")
         self.voxel = float(voxel)
         self._model = MODEL_CODE[camera.model]
         self._params = camera.index_params()

@@ -71,8 +71,9 @@ class TsdfVolume:
     """
 
     def __init__(self, camera: Camera, kind: DepthKind, voxel: float, *, max_blocks: int = 24_000) -> None:
-        if not voxel > 0 or max_blocks < 1:
-            raise ValueError(f"a voxel needs a size and a volume needs blocks, got {voxel} and {max_blocks}")
+        # Blocks on different sides of the origin never merge: eight are the fewest.
+        if not voxel > 0 or max_blocks < 8:
+            raise ValueError(f"a voxel needs a size and a volume at least eight blocks, got {voxel} and {max_blocks}")
         self.voxel = float(voxel)
         self._model = MODEL_CODE[camera.model]
         self._params = camera.index_params()
