@@ -35,7 +35,7 @@ from rich.table import Table
 
 from benchmarks.sequences import DATA, find_sequence
 from vipe_core.depth.aligned import AlignedDepth
-from vipe_core.depth.alignment import Samples, measure
+from vipe_core.depth.alignment import Samples, guess, measure
 from vipe_core.depth.anchors import AnchorFinder
 from vipe_core.depth.known import KnownLength
 from vipe_core.depth.scale import normalised
@@ -156,9 +156,9 @@ def _one_for_all(maps: list[Array], samples: list[Samples]) -> list[Array]:
         np.concatenate([s.scene for s in samples])[::7],
         np.concatenate([s.weight for s in samples])[::7],
     )
-    found = measure(pooled, (float(np.median(pooled.scene) / np.nanmedian(np.abs(pooled.video))), 0.0))
-    assert found is not None
-    alpha, beta = np.linalg.solve(found.information, found.vector)
+    start = guess(pooled.video, float(np.median(pooled.scene)))
+    found = measure(pooled, start)
+    alpha, beta = start if found is None else found.solution(start)
     return [np.maximum(alpha * x + beta, _FLOOR) for x in maps]
 
 
@@ -185,9 +185,9 @@ def _bound(maps: list[Array], sequence: _Sequence) -> list[Array]:
         inverse, valid = _true(sequence, index)
         at = cv2.resize(x, (inverse.shape[1], inverse.shape[0]), interpolation=cv2.INTER_NEAREST).astype(np.float64)
         use = valid & np.isfinite(at)
-        found = measure(Samples(at[use], inverse[use], np.ones(int(use.sum()))), (1.0, 0.0))
-        assert found is not None
-        alpha, beta = np.linalg.solve(found.information, found.vector)
+        start = guess(at[use], float(np.median(inverse[use])))
+        found = measure(Samples(at[use], inverse[use], np.ones(int(use.sum()))), start)
+        alpha, beta = start if found is None else found.solution(start)
         out.append(np.maximum(alpha * x + beta, _FLOOR * float(np.median(inverse[use]))))
     return out
 

@@ -33,8 +33,8 @@ Array = NDArray[Any]
 
 logger = logging.getLogger(__name__)
 
-# Depth ends at so many times the typical one.
-_FAR = 1000.0
+# Depth ends at so many times the farthest that the map knows, which is this quantile of its inverse depth.
+_FAR, _FARTHEST = 5.0, 0.01
 # Relative errors that halve the confidence: of the video depth around a pixel, and of the alignment as a whole.
 _HALF_LOCAL, _HALF_SCALE = 0.05, 0.05
 # Cells over which errors are averaged, and what the frame's own counts as, in samples.
@@ -87,13 +87,14 @@ class AlignedDepth:
             for shot in shots_of(scene):
                 numbers, cells = believed_cells(scene, shot)
                 values = scene.inverse_depth[numbers][cells]
-                median = float(np.median(values)) if len(values) else 1.0
+                farthest, median = np.quantile(values, (_FARTHEST, 0.5)) if len(values) else (1.0, 1.0)
+                least = float(farthest) / _FAR
                 part = islice(_counted(ahead, count), shot[1] - shot[0])
-                for waiting, affine, sigma in self._aligned(part, finder, median):
+                for waiting, affine, sigma in self._aligned(part, finder, float(median)):
                     picture = next(behind, None)
                     if picture is None:
                         raise _too_short(waiting.index, count)
-                    yield self._finish(picture, waiting, affine, sigma, finder, scene, median)
+                    yield self._finish(picture, waiting, affine, sigma, finder, scene, least)
 
     def _aligned(
         self, frames: Iterator[Frame], finder: AnchorFinder, median: float
@@ -125,18 +126,20 @@ class AlignedDepth:
         sigma: float,
         finder: AnchorFinder,
         scene: SceneMap,
-        median: float,
+        least: float,
     ) -> DepthFrame:
         """Depth at source size, and how far it is to be believed."""
         height, width = picture.rgb.shape[:2]
-        least = median / _FAR
         nothing = np.isnan(waiting.video) | (finder.along <= 0)
         aligned = apply(waiting.video, affine, least)
         far = (aligned <= least) & ~nothing
         # Of the model's kind; the stage's is along the rays.
         along = np.where(finder.along > 0, finder.along, 1.0).astype(np.float32)
-        aligned = np.where(nothing, np.float32(median), aligned / along)
+        # A hole is taken for as far as the rest typically is: there is nothing to fill it with.
+        typical = np.float32(1.0) if nothing.all() else np.median(aligned[~nothing])
+        aligned = np.where(nothing, typical, aligned / along)
         confidence = self._confidence(waiting, affine, sigma, scene)
+        # In inverse depth, so that an edge against the sky keeps to what is in front of it.
         large = cv2.resize(aligned, (width, height), interpolation=cv2.INTER_LINEAR)
         sure = np.clip(cv2.resize(confidence, (width, height), interpolation=cv2.INTER_LINEAR), 0, 1)
         moving = self._moving(picture, scene)

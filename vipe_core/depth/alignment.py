@@ -88,6 +88,12 @@ class Measurement:
     inliers: float
     regime: Regime
 
+    def solution(self, start: Affine) -> Affine:
+        """(alpha, beta) of this frame by itself; what it leaves open is as in `start`."""
+        weak = 1e-6 * np.diag(np.diag(self.information))
+        alpha, beta = np.linalg.solve(self.information + weak, self.vector + weak @ np.array(start))
+        return float(alpha), float(beta)
+
 
 def guess(video: Array, median: float) -> Affine:
     """An affine map that makes any video depth positive with a given median, where nothing else is known."""

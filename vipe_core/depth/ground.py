@@ -26,19 +26,18 @@ Array = NDArray[Any]
 _TOGETHER, _POINTS = 9, 1500
 _HYPOTHESES, _JUDGES = 1500, 3000
 # Error of an inverse depth that still lies on the plane: relative, and as a share of the median.
-_TOLERANCE, _FLOOR = 0.03, 0.01
+# A noisier map needs the wider one, which is worth less.
+_TOLERANCES, _FLOOR = (0.03, 0.05), 0.3
 # Widths of the kernels of the refinement in units of it: the map is often better.
 _WIDTHS = (1.0, 1.0, 0.7, 0.5, 0.5, 0.5)
 # Cameras are held without much roll, but may look down: how far the ground may seem tilted to either side and forwards.
 _MAX_ROLL_DEG, _MAX_PITCH_DEG = 15.0, 50.0
 # The least share of the points that must lie on the ground, and the least count.
-_MIN_SHARE, _MIN_INLIERS = 0.06, 100
+_MIN_SHARE, _MIN_INLIERS = 0.04, 100
 # Nothing lies below the ground: points that would, as a share of those on it. Each costs as much as two on it bring.
 _MAX_BELOW, _BELOW_COST = 0.15, 2.0
 # The least share of the groups that must find ground, and the largest difference in height of those that agree.
 _MIN_FOUND, _AGREE = 0.4, 0.1
-# What the ground is (a kerb, a carpet, the slope between) and errors that all parts share: they do not average out.
-_SHARED_SIGMA = 0.03
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,24 +49,26 @@ class _Points:
         centres: (n, 3) of the camera that measured each.
         inverse_depth: (n,) along the rays.
         weight: (n,).
+        sigma: (n,) error of the inverse depth that is ordinary.
     """
 
     rays: NDArray[np.float64]
     centres: NDArray[np.float64]
     inverse_depth: NDArray[np.float64]
     weight: NDArray[np.float64]
+    sigma: NDArray[np.float64]
 
     def some(self, chosen: Array) -> _Points:
-        return _Points(self.rays[chosen], self.centres[chosen], self.inverse_depth[chosen], self.weight[chosen])
+        parts = (self.rays, self.centres, self.inverse_depth, self.weight, self.sigma)
+        return _Points(*(part[chosen] for part in parts))
 
     def residuals(self, normals: Array, offsets: Array) -> NDArray[np.float64]:
         """(m, n) inverse depths minus those of m planes normal . x = offset, over what counts as ordinary: negative
         is below."""
         d = self.inverse_depth
         height = offsets[:, None] - normals @ self.centres.T
-        sigma = _TOLERANCE * d + _FLOOR * np.median(d)
         expected = (normals @ self.rays.T) / np.where(height > 0, height, np.inf)
-        return np.asarray((d - expected) / sigma)
+        return np.asarray((d - expected) / self.sigma)
 
 
 def scale_from_height(scene: SceneMap, shot: tuple[int, int], height_m: float) -> ScaleEstimate:
@@ -79,14 +80,19 @@ def scale_from_height(scene: SceneMap, shot: tuple[int, int], height_m: float) -
     numbers = np.flatnonzero((scene.keyframes >= shot[0]) & (scene.keyframes < shot[1]))
     projector = MapProjector(scene)
     groups = max(1, round(len(numbers) / _TOGETHER * 2) - 1)
-    ratios = []
-    for group in range(groups):
-        first = round(group * (len(numbers) - _TOGETHER) / max(groups - 1, 1)) if groups > 1 else 0
-        found = _ground(scene, projector, numbers[first : first + _TOGETHER], seed=group)
-        if found is not None:
-            heights, share = found
-            # The camera may bob: what is known is its usual height.
-            ratios.append(FrameRatio(math.log(height_m / float(np.median(heights))), _TOLERANCE, share))
+    ratios: list[FrameRatio] = []
+    tolerance = _TOLERANCES[0]
+    for tolerance in _TOLERANCES:
+        ratios = []
+        for group in range(groups):
+            first = round(group * (len(numbers) - _TOGETHER) / max(groups - 1, 1)) if groups > 1 else 0
+            found = _ground(scene, projector, numbers[first : first + _TOGETHER], tolerance, seed=group)
+            if found is not None:
+                heights, share = found
+                # The camera may bob: what is known is its usual height.
+                ratios.append(FrameRatio(math.log(height_m / float(np.median(heights))), tolerance, share))
+        if len(ratios) >= _MIN_FOUND * groups:
+            break
     elsewhere = "say path=METRES or depth=METRES@X,Y,FRAME"
     if len(ratios) < _MIN_FOUND * groups:
         raise ScaleUnobservable(f"no ground is seen below the camera; {elsewhere}")
@@ -94,19 +100,20 @@ def scale_from_height(scene: SceneMap, shot: tuple[int, int], height_m: float) -
     centre, _, _ = consensus(values, weights, _AGREE)
     if (np.abs(values - centre) < 2 * _AGREE).mean() < 0.5:
         raise ScaleUnobservable(f"parts of the video disagree about the ground below the camera; {elsewhere}")
-    estimate = scale_from_ratios(ratios, _SHARED_SIGMA)
+    # What the ground is (a kerb, a carpet, the slope between) and errors that all parts share do not average out.
+    estimate = scale_from_ratios(ratios, tolerance)
     if estimate is None:
         raise ScaleUnobservable(f"no ground is seen below the camera; {elsewhere}")
     return estimate
 
 
 def _ground(
-    scene: SceneMap, projector: MapProjector, numbers: NDArray[np.int64], seed: int
+    scene: SceneMap, projector: MapProjector, numbers: NDArray[np.int64], tolerance: float, seed: int
 ) -> tuple[NDArray[np.float64], float] | None:
     """Heights of some keyframes above the ground that they see together, and the share of their points on it."""
     rng = np.random.default_rng(seed)
     poses = scene.world_from_cam[scene.keyframes[numbers]]
-    points = _pooled(projector, numbers, poses, rng)
+    points = _pooled(projector, numbers, poses, tolerance, rng)
     if points is None:
         return None
     right, down = poses[:, :3, 0], poses[:, :3, 1]
@@ -140,7 +147,7 @@ def _ground(
 
 
 def _pooled(
-    projector: MapProjector, numbers: NDArray[np.int64], poses: Array, rng: np.random.Generator
+    projector: MapProjector, numbers: NDArray[np.int64], poses: Array, tolerance: float, rng: np.random.Generator
 ) -> _Points | None:
     rays, centres, depths, weights = [], [], [], []
     for k, pose in zip(numbers, poses, strict=True):
@@ -152,15 +159,16 @@ def _pooled(
         weights.append(w[chosen])
     if sum(map(len, depths)) < _MIN_INLIERS:
         return None
-    return _Points(np.concatenate(rays), np.concatenate(centres), np.concatenate(depths), np.concatenate(weights))
+    d = np.concatenate(depths)
+    sigma = tolerance * (d + _FLOOR * np.median(d))
+    return _Points(np.concatenate(rays), np.concatenate(centres), d, np.concatenate(weights), sigma)
 
 
 def _refined(points: _Points, normal: Array, offset: float) -> tuple[Array, float]:
     """Least squares in inverse depth with the weights of Geman and McClure: what lies off the plane has no say."""
     for width in _WIDTHS:
         residual = points.residuals(normal[None], np.array([offset]))[0] / width
-        sigma = _TOLERANCE * points.inverse_depth + _FLOOR * np.median(points.inverse_depth)
-        weight = points.weight / sigma**2 / np.square(1 + np.square(residual))
+        weight = points.weight / points.sigma**2 / np.square(1 + np.square(residual))
         # d (offset - n . c) = n . r, with n / offset as the unknown: n . (r + d c) / offset = d.
         rows = points.rays + points.inverse_depth[:, None] * points.centres
         matrix = rows.T @ (weight[:, None] * rows)

@@ -79,10 +79,8 @@ def _between(new: Array, old: Array) -> Affine:
     found = measure(Samples(x, y + lift, np.ones_like(x)), start)
     if found is None:
         return start[0], start[1] - lift
-    # Frames without any range of depth leave the scale open: it is the old one's then.
-    weak = 1e-6 * np.diag(np.diag(found.information))
-    alpha, beta = np.linalg.solve(found.information + weak, found.vector + weak @ np.array(start))
-    return float(alpha), float(beta) - lift
+    alpha, beta = found.solution(start)
+    return alpha, beta - lift
 
 
 def _faded(old: Array, new: Array, share: Array) -> NDArray[np.float32]:
