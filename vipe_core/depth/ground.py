@@ -25,8 +25,8 @@ Array = NDArray[Any]
 # Keyframes that look for the ground together, and points of each that take part.
 _TOGETHER, _POINTS = 9, 1500
 _HYPOTHESES, _JUDGES = 1500, 3000
-# Error of an inverse depth that still lies on the plane: relative, and as a share of the median.
-# A noisier map needs the wider one, which is worth less.
+# Relative error of an inverse depth that still lies on the plane (a noisier map needs the wider one, which is worth
+# less), and the share of the median that is added to what it is relative to.
 _TOLERANCES, _FLOOR = (0.03, 0.05), 0.3
 # Widths of the kernels of the refinement in units of it: the map is often better.
 _WIDTHS = (1.0, 1.0, 0.7, 0.5, 0.5, 0.5)
