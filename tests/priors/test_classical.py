@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 import pytest
 from box_room import BoxRoom, look
+from numpy.typing import NDArray
 
 from vipe_core.priors.classical import (
     CombinedFocalInit,
@@ -15,7 +16,7 @@ from vipe_core.priors.classical import (
     TwoViewFocal,
     classical_priors,
 )
-from vipe_core.priors.classical.features import cell_centres_px, grid_of
+from vipe_core.priors.classical.features import FlowFeatures, cell_centres_px, grid_of
 from vipe_core.priors.protocols import WorkingFrame
 
 
@@ -154,6 +155,20 @@ def test_tracks_are_sharp_and_lie_on_the_grid(room: BoxRoom) -> None:
     assert np.abs(error[np.linalg.norm(error, axis=1) < 1].mean(axis=0)).max() < 0.05
 
 
+def _all(features: FlowFeatures) -> NDArray[np.bool_]:
+    return np.ones(features.grid.num_cells, dtype=np.bool_)
+
+
+def test_only_wanted_cells_are_aligned(room: BoxRoom) -> None:
+    _, a, b, truth, _ = pair(room, look((0, 0, -3)), look((0.2, 0.05, -2.9)))
+    wanted = np.arange(a.grid.num_cells) % 2 == 0
+    everything = PatchAligner().align(a, b, truth, _all(a))
+    half = PatchAligner().align(a, b, truth, wanted)
+    np.testing.assert_array_equal(half.weight[wanted], everything.weight[wanted])
+    assert not half.weight[~wanted].any()
+    assert abs(half.consistent - everything.consistent) < 0.1
+
+
 def test_patches_are_sharper_than_flow_and_do_not_follow_the_error_of_their_guess(room: BoxRoom) -> None:
     source, target = look((0, 0, -3)), look((0.45, 0.05, -2.7), yaw_deg=-4)
     matcher, a, b, truth, visible = pair(room, source, target)
@@ -161,7 +176,7 @@ def test_patches_are_sharper_than_flow_and_do_not_follow_the_error_of_their_gues
     # What a map with slightly wrong poses and depths would say: off by a smooth pixel or so.
     wave = np.stack([np.sin(truth[:, 1] / 60), np.cos(truth[:, 0] / 70)], axis=-1) + rng.normal(0, 0.05, truth.shape)
     guess = np.where(visible[:, None], truth + wave, np.nan)
-    aligned = PatchAligner().align(a, b, guess)
+    aligned = PatchAligner().align(a, b, guess, _all(a))
     good = visible & (aligned.weight.min(axis=1) > 1)
     assert good.sum() > 0.5 * visible.sum()
     error = np.linalg.norm(aligned.target_px - truth, axis=1)
@@ -178,17 +193,17 @@ def test_patches_stand_a_change_of_exposure_and_refuse_another_scene(room: BoxRo
     source, target = look((0, 0, -3)), look((0.2, 0.0, -3))
     matcher, a, b, truth, visible = pair(room, source, target)
     guess = np.where(visible[:, None], truth + 0.7, np.nan)
-    plain = PatchAligner().align(a, b, guess)
+    plain = PatchAligner().align(a, b, guess, _all(a))
     darker = matcher.encode(
         WorkingFrame(1, (0.7 * b.gray + 20).astype(np.uint8), np.zeros((*b.gray.shape, 3), np.uint8))
     )
-    changed = PatchAligner().align(a, darker, guess)
+    changed = PatchAligner().align(a, darker, guess, _all(a))
     both = (plain.weight.min(axis=1) > 1) & (changed.weight.min(axis=1) > 1)
     assert both.sum() > 0.8 * (plain.weight.min(axis=1) > 1).sum()
     assert np.median(np.linalg.norm(changed.target_px - plain.target_px, axis=1)[both]) < 0.05
     noise = np.random.default_rng(1).integers(0, 255, b.gray.shape).astype(np.uint8)
     other = matcher.encode(WorkingFrame(2, cv2.GaussianBlur(noise, (0, 0), 2), np.zeros((*b.gray.shape, 3), np.uint8)))
-    assert PatchAligner().align(a, other, guess).weight.mean() < 0.1 * plain.weight.mean()
+    assert PatchAligner().align(a, other, guess, _all(a)).weight.mean() < 0.1 * plain.weight.mean()
 
 
 def test_patches_keep_off_masks_borders_and_cells_without_a_guess(room: BoxRoom) -> None:
@@ -196,13 +211,13 @@ def test_patches_keep_off_masks_borders_and_cells_without_a_guess(room: BoxRoom)
     half = np.ones(b.gray.shape, bool)
     half[:, : b.gray.shape[1] // 2] = False
     masked = DisFlowMatcher().encode(WorkingFrame(5, b.gray, np.zeros((*b.gray.shape, 3), np.uint8), half))
-    match = PatchAligner().align(a, masked, truth)
+    match = PatchAligner().align(a, masked, truth, _all(a))
     assert (match.weight[truth[:, 0] < b.gray.shape[1] // 2 - 1] == 0).all()
-    nothing = PatchAligner().align(a, b, np.full_like(truth, np.nan))
+    nothing = PatchAligner().align(a, b, np.full_like(truth, np.nan), _all(a))
     assert (nothing.weight == 0).all()
     assert np.isfinite(nothing.target_px).all()
     assert nothing.consistent == 0
-    outside = PatchAligner().align(a, b, truth + 5000)
+    outside = PatchAligner().align(a, b, truth + 5000, _all(a))
     assert (outside.weight == 0).all()
 
 

@@ -51,3 +51,17 @@ def test_a_right_principal_point_and_a_short_map_stay_as_they_are() -> None:
         np.testing.assert_array_equal(keyframes.poses(), poses)
         np.testing.assert_array_equal(keyframes.depths(), depths)
         np.testing.assert_array_equal(keyframes.intrinsics, intrinsics)
+
+
+def test_what_the_halves_of_a_map_do_not_agree_on_moves_nothing() -> None:
+    keyframes, graph, adjuster = adjusted(0.0)
+    noise = np.random.default_rng(1)
+    # Something else than the lens bends each half its own way.
+    for i, j in list(graph):
+        match = graph[i, j]
+        radius = (match.target_px[:, 0] - WIDTH / 2) / WIDTH
+        sign = 1.0 if i + j < COUNT - 1 else -1.0
+        match.target_px[:, 0] += (sign * 2.0 * radius**2 + noise.normal(0, 0.02, radius.shape)).astype(np.float32)
+    before = keyframes.intrinsics[2]
+    refine_principal_point(keyframes, graph, adjuster)
+    assert abs(keyframes.intrinsics[2] - before) < 1.0

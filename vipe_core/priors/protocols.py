@@ -88,15 +88,16 @@ class SparseTracker(Protocol):
 class Aligner(Protocol):
     """Measurements of the last digit, once the geometry is known to a few pixels (paper: the recurrent update)."""
 
-    def align(self, source: Any, target: Any, guess_px: Array) -> Match:
+    def align(self, source: Any, target: Any, guess_px: Array, wanted: Array) -> Match:
         """One-way measurement, each cell by itself.
 
         Args:
             guess_px: (P, 2) where the current estimate sees the source cells in the target, right to a few pixels; NaN
-                where they are not to be looked for. Its local derivative tells how the picture is distorted.
+                where it knows nothing. Its local derivative tells how the picture is distorted.
+            wanted: (P,) bool, the cells to measure.
 
         Returns:
-            `consistent` is the share of the textured cells with a guess that were aligned.
+            `consistent` is the share of the textured ones of the wanted cells with a guess that were aligned.
         """
 
 

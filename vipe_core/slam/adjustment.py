@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from vipe_core.ba import solve
+from vipe_core.ba import robust_scale_px, solve
 from vipe_core.ba.problem import Free, Grid, Options, Priors, Problem, Result, RobustKernel, State, Status
 from vipe_core.slam.graph import Graph
 from vipe_core.slam.keyframes import KeyframeMap
@@ -27,6 +27,8 @@ logger = logging.getLogger(__name__)
 Array = NDArray[Any]
 
 _MIN_ROBUST_SCALE_PX = 1.0
+# Matching is hardly ever better than a tenth of a pixel, and errors of that size are not Gaussian.
+_LEAST_SCALE_PX = 0.5
 PROBED_SHARE = 0.25
 """Share of the cells that `Adjuster.probe` takes."""
 
@@ -42,28 +44,31 @@ class Step:
         scale: Its scale as a multiple of `SlamSettings.robust_scale_px`.
         iterations: Bound on solver steps.
         tolerance: The solve goes on while a step lowers the cost by at least this share.
+        measured_scale: `scale` is the most; where the residuals are smaller, it is what makes the kernel efficient for
+            them. What moves a pixel or two a frame is an outlier then, and does not bend the map.
     """
 
     robust: RobustKernel
     scale: float
     iterations: int
     tolerance: float = 1e-2
+    measured_scale: bool = False
 
 
 FROM_SCRATCH = (
     Step("huber", 1.0, 12),
     Step("geman_mcclure", 4.0, 8),
-    Step("geman_mcclure", 1.0, 8, 1e-3),
+    Step("geman_mcclure", 1.0, 8, 1e-3, measured_scale=True),
 )
 """The start may be anything: a convex kernel first."""
 
 TRACK = (Step("geman_mcclure", 4.0, 4), Step("geman_mcclure", 1.0, 4, 1e-3))
 """One new pose that motion-only tracking has brought within a few pixels."""
 
-REFINE = (Step("geman_mcclure", 4.0, 10), Step("geman_mcclure", 1.0, 15, 1e-3))
+REFINE = (Step("geman_mcclure", 4.0, 10), Step("geman_mcclure", 1.0, 15, 1e-3, measured_scale=True))
 """Everything is near its place."""
 
-SETTLE = (Step("geman_mcclure", 1.0, 15, 1e-4),)
+SETTLE = (Step("geman_mcclure", 1.0, 15, 1e-4, measured_scale=True),)
 """Everything is in its place but for the last digit."""
 
 
@@ -197,13 +202,18 @@ class Adjuster:
         result: Result | None = None
         for step in schedule:
             self.alive()
+            scale_px = step.scale * self.robust_scale_px
+            at = state if result is None else result.state
+            if step.measured_scale:
+                least = min(_LEAST_SCALE_PX, scale_px)
+                scale_px = robust_scale_px(problem, at, step.robust, (least, scale_px))
             options = Options(
                 max_iterations=step.iterations,
                 robust=step.robust,
-                robust_scale_px=step.scale * self.robust_scale_px,
+                robust_scale_px=scale_px,
                 relative_tolerance=step.tolerance,
             )
-            solved = solve(problem, state if result is None else result.state, options)
+            solved = solve(problem, at, options)
             if solved.status is Status.EMPTY:
                 return result
             if solved.status in _FAILED:

@@ -31,6 +31,8 @@ _OBSERVED_RATIO = 0.7
 # Share of a keyframe's cells whose change of mask calls for another adjustment.
 _VISIBLE_CHANGE = 0.02
 _SUBSAMPLE = 4
+# The first sharpening measures every other cell, as on a chessboard.
+_READYING = 2
 # The principal point couples with rotation and position, so that one round of probes only comes near.
 _MAX_CENTRINGS = 3
 
@@ -88,7 +90,8 @@ class Backend:
     def sharpen(self) -> Result | None:
         """Measure every edge again from the adjusted geometry and adjust; then once more, and keyframes farther apart.
 
-        The second time starts from depths that know the distortion of the patches better, which wide edges need most.
+        The second time starts from depths that know the distortion of the patches better, which wide edges need most;
+        half of the cells are enough to get there.
         Steps between neighbours add up like a random walk. Edges over several keyframes hold the sum.
         The motion masks stay: alignments start from where the cells would be if nothing moved.
         """
@@ -98,7 +101,7 @@ class Backend:
         for wide in (False, True):
             edges = sorted({*self._measured.graph, *(self._wide_edges() if wide else ())})
             for i, j in edges:
-                self._measured.sharpen(i, j, self._settings.min_consistent)
+                self._measured.sharpen(i, j, self._settings.min_consistent, every=1 if wide else _READYING)
             result = self._adjust(SETTLE)
         self._keyframes.normalise_scale()
         return result

@@ -256,9 +256,8 @@ class _ShotInfill:
         matches = []
         for k, match in frame.matches:
             induced = self._induced(k, cam_from_world)
-            wanted = induced.visible & self._usable[k]
-            guess_px = np.where(wanted[:, None], induced.target_px, np.float32(np.nan))
-            aligned = aligner.align(self._keyframes.features[k], frame.features, guess_px)
+            guess_px = np.where(induced.visible[:, None], induced.target_px, np.float32(np.nan))
+            aligned = aligner.align(self._keyframes.features[k], frame.features, guess_px, self._usable[k])
             matches.append((k, sharpen(match, aligned)))
         return _Pending(frame.index, frame.features, cam_from_world, tuple(matches), frame.agreed)
 

@@ -117,17 +117,19 @@ class MeasuredGraph:
     def can_sharpen(self) -> bool:
         return self._aligner is not None
 
-    def sharpen(self, i: int, j: int, min_aligned: float) -> None:
+    def sharpen(self, i: int, j: int, min_aligned: float, every: int = 1) -> None:
         """Measure the static cells of i -> j once more, from where the poses and depths of the map put them.
 
         Args:
             min_aligned: A new edge is filed only if at least this share of its cells is aligned.
+            every: Measure each `every`-th cell only, those of the next row shifted by one.
         """
         assert self._aligner is not None
         induced = self._reprojector.edge(self.keyframes, i, j)
-        wanted = induced.visible & self.keyframes.static(i)
-        guess_px = np.where(wanted[:, None], induced.target_px, np.float32(np.nan))
-        aligned = self._aligner.align(self.keyframes.features[i], self.keyframes.features[j], guess_px)
+        guess_px = np.where(induced.visible[:, None], induced.target_px, np.float32(np.nan))
+        row, column = np.divmod(np.arange(self.keyframes.grid.num_cells), self.keyframes.grid.width)
+        wanted = self.keyframes.static(i) & ((row + column) % every == 0)
+        aligned = self._aligner.align(self.keyframes.features[i], self.keyframes.features[j], guess_px, wanted)
         if (i, j) in self.graph:
             self.graph.add(i, j, sharpen(self.graph[i, j], aligned))
         elif aligned.consistent >= min_aligned:

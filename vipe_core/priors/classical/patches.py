@@ -85,25 +85,25 @@ class PatchAligner:
         self._kept = kept
         self._pictures: OrderedDict[int, tuple[FlowFeatures, NDArray[np.float32]]] = OrderedDict()
 
-    def align(self, source: FlowFeatures, target: FlowFeatures, guess_px: Array) -> Match:
+    def align(self, source: FlowFeatures, target: FlowFeatures, guess_px: Array, wanted: Array) -> Match:
         """See `Aligner.align`."""
-        target_px, information, residual = self._aligned(source, target, guess_px)
+        target_px, information, residual = self._aligned(source, target, guess_px, wanted)
         found = information[:, 0] + information[:, 2] > 0
         if target.usable is not None:
             found &= sample_px(target.usable.astype(np.float32), target_px) > 0.5
         weight = np.where(found[:, None], self._weight * _certainty(information, residual), 0)
-        looked = np.flatnonzero(source.textured_cells & np.isfinite(guess_px[:, 0] + guess_px[:, 1]))
+        looked = np.flatnonzero(source.textured_cells & wanted & np.isfinite(guess_px[:, 0] + guess_px[:, 1]))
         consistent = float((larger(weight)[looked] > 0).mean()) if len(looked) else 0.0
         return Match(target_px, weight.astype(np.float32), consistent)
 
     def _aligned(
-        self, source: FlowFeatures, target: FlowFeatures, guess_px: Array
+        self, source: FlowFeatures, target: FlowFeatures, guess_px: Array, wanted: Array
     ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
         """Target positions (the guess where there is no alignment), (P, 3) mean of (gx gx, gx gy, gy gy) over the
         patches in target coordinates, and (P, 2) mean square of what is left and of the patch about its mean."""
         grid = source.grid
         affine = local_affine(guess_px, grid)
-        wanted = source.usable_cells & np.isfinite(guess_px[:, 0] + guess_px[:, 1])
+        wanted = wanted & source.usable_cells & np.isfinite(guess_px[:, 0] + guess_px[:, 1])
         for column in affine.T:
             wanted &= np.isfinite(column)
         start = np.where(wanted[:, None], guess_px, 0).astype(np.float32)
