@@ -10,7 +10,6 @@ import pytest
 from vipe_core.annotation import Quality
 from vipe_core.cameras import Camera
 from vipe_core.quality import assess
-from vipe_core.slam.backend import FocalReport
 from vipe_core.slam.diagnostics import LoopReport, MapReport
 from vipe_core.slam.infill import Trajectory
 from vipe_core.slam.settings import SlamSettings
@@ -58,7 +57,7 @@ def good(**changes: object) -> SlamResult:
         working=_WORKING,
         camera=Camera.pinhole_from_fov(60.0, 320, 240),
         motion="general",
-        focal=FocalReport(0.01, observed=True),
+        focal_sigma_ratio=0.01,
         map=good_map(),
         loops=LoopReport(3, 2.0, 0.5, 0.01),
         timings_s={},
@@ -91,7 +90,7 @@ def test_a_good_result_is_reliable_and_its_residual_is_in_source_pixels() -> Non
         (good(map=good_map(inlier_ratio=0.5)), "low_inliers", "doubtful"),
         (good(map=good_map(inlier_ratio=0.3)), "low_inliers", "no"),
         (good(map=good_map(weakest_link=0.01)), "weak_link", "no"),
-        (good(focal=FocalReport(0.2, observed=False)), "focal_unobservable", "doubtful"),
+        (good(focal_sigma_ratio=0.2), "focal_unobservable", "doubtful"),
         (good(keyframes=np.arange(3, dtype=np.int64)), "few_keyframes", "doubtful"),
         (good(timestamps_s=np.arange(4) / 30.0), "few_frames", "doubtful"),
         (good(trajectory=posed(4)), "interpolated_frames", "doubtful"),
@@ -109,7 +108,7 @@ def test_the_field_of_view_comes_with_an_interval_as_wide_as_the_focal_length_is
     low, high = verdict(good()).fov_interval_deg
     # log(f) +- 0.0196 about 60 degrees: d fov = sin(fov) d log(f)
     assert (low, high) == pytest.approx((60 - 0.9726, 60 + 0.9726), abs=0.02)
-    wider = verdict(good(focal=FocalReport(0.3, observed=False))).fov_interval_deg
+    wider = verdict(good(focal_sigma_ratio=0.3)).fov_interval_deg
     assert wider[0] < 40 < 80 < wider[1] < 180
 
 

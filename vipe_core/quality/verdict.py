@@ -97,7 +97,7 @@ def assess(result: SlamResult, settings: SlamSettings, source_width: int) -> Qua
         inlier_ratio=found.inlier_ratio,
         coverage=found.coverage,
         parallax_deg=found.parallax_deg,
-        focal_sigma_ratio=result.focal.sigma_ratio,
+        focal_sigma_ratio=result.focal_sigma_ratio,
         fov_interval_deg=(low_deg, high_deg),
         frame_inlier_ratio=result.trajectory.inlier_ratio,
         frame_residual_px=(result.trajectory.residual_px * to_source).astype(np.float32),
@@ -114,6 +114,6 @@ def assess(result: SlamResult, settings: SlamSettings, source_width: int) -> Qua
 def _fov_interval_deg(result: SlamResult) -> tuple[float, float]:
     """The field of view for the focal length's 95 % interval, in which log(f) is taken to be normal."""
     camera = result.camera
-    half = math.exp(1.96 * min(result.focal.sigma_ratio, _NO_IDEA))
+    half = math.exp(1.96 * min(result.focal_sigma_ratio, _NO_IDEA))
     low, high = (2 * math.degrees(math.atan(camera.width / 2 / (camera.focal_px * f))) for f in (half, 1 / half))
     return low, high

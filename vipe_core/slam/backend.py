@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -26,8 +25,6 @@ logger = logging.getLogger(__name__)
 Array = NDArray[Any]
 
 _FOV_RANGE_DEG = (12.0, 150.0)
-# The adjustment has learnt something when it is this much surer than its prior.
-_OBSERVED_RATIO = 0.7
 # Share of a keyframe's cells whose change of mask calls for another adjustment.
 _VISIBLE_CHANGE = 0.02
 _SUBSAMPLE = 4
@@ -37,21 +34,13 @@ _READYING = 2
 _MAX_CENTRINGS = 3
 
 
-@dataclass(frozen=True, slots=True)
-class FocalReport:
-    """What the last global adjustment says about the focal length.
+class Backend:
+    """Global adjustment of the map that `MeasuredGraph` holds.
 
     Attributes:
-        sigma_ratio: Inflated 1-sigma of the focal length as a share of it.
-        observed: Whether the adjustment determined it; otherwise it is the initialisation's.
+        focal_sigma_ratio: 1-sigma of the focal length after the last adjustment, as a share of it; the prior's where
+            the adjustment held it.
     """
-
-    sigma_ratio: float
-    observed: bool
-
-
-class Backend:
-    """Global adjustment of the map that `MeasuredGraph` holds."""
 
     def __init__(
         self,
@@ -70,7 +59,7 @@ class Backend:
         self._settings = settings
         self._width = working_width
         self._closer = LoopCloser(measured, adjuster, reprojector)
-        self.focal = FocalReport(adjuster.focal_prior.sigma, observed=False)
+        self.focal_sigma_ratio = adjuster.focal_prior.sigma
 
     def run(self) -> Result | None:
         """Add edges between keyframes that overlap, adjust everything, renormalise the scale to median depth 1."""
@@ -151,15 +140,14 @@ class Backend:
         result = self._adjust_everything(schedule, free_focal=True)
         if result is None:
             return None
-        prior_sigma = self._adjuster.focal_prior.sigma
         # A pinhole leaves out the distortion of a real lens, which more measurements do not average away.
         sigma = math.hypot(self._settings.focal_sigma_inflation * result.log_focal_sigma, self._settings.lens_sigma)
         fov_deg = math.degrees(2 * math.atan(self._width / 2 / float(self._keyframes.intrinsics[0])))
         if math.isfinite(sigma) and _FOV_RANGE_DEG[0] < fov_deg < _FOV_RANGE_DEG[1]:
-            self.focal = FocalReport(sigma, observed=sigma < _OBSERVED_RATIO * prior_sigma)
+            self.focal_sigma_ratio = sigma
             return result
         logger.info("focal length held: it went to a field of view of %.1f deg, sigma %.3f", fov_deg, sigma)
-        self.focal = FocalReport(prior_sigma, observed=False)
+        self.focal_sigma_ratio = self._adjuster.focal_prior.sigma
         self._keyframes.restore(before)
         return self._adjust_everything(schedule, free_focal=False)
 

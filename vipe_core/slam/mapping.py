@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from vipe_core.priors.protocols import PriorFamily
 from vipe_core.slam.adjustment import Adjuster, FocalPrior
-from vipe_core.slam.backend import Backend, FocalReport
+from vipe_core.slam.backend import Backend
 from vipe_core.slam.bootstrap import Bootstrap
 from vipe_core.slam.diagnostics import LoopReport, MapReport, examine, examine_loops
 from vipe_core.slam.graph import Graph
@@ -48,7 +48,7 @@ class ShotMap:
     Attributes:
         shot: Which frames it is of.
         motion: What kind of camera motion was found.
-        focal: What its adjustment says about the focal length.
+        focal_sigma_ratio: 1-sigma of the focal length as a share of it.
         found: Diagnostics.
         loops: What its loop edges did.
         adjuster: Ran its adjustments.
@@ -61,7 +61,7 @@ class ShotMap:
     keyframes: KeyframeMap
     graph: Graph
     motion: Motion
-    focal: FocalReport
+    focal_sigma_ratio: float
     found: MapReport
     loops: LoopReport
     adjuster: Adjuster
@@ -148,25 +148,31 @@ class ShotMapper:
             backend.sharpen()
         found = examine(reprojector, keyframes, graph, adjuster.robust_scale_px)
         motion: Motion = "static" if static else "general"
-        focal, fitter = backend.focal, None
+        focal_sigma_ratio, fitter = backend.focal_sigma_ratio, None
         if not static and found.parallax_deg < _MAYBE_ROTATION_DEG:
             candidate = RotationFitter("pinhole", size.grid, adjuster.robust_scale_px)
             with self._clock("rotation"):
                 turned = self._rotation_only(candidate, keyframes, graph, prior, found)
             if turned is not None:
-                motion, focal, fitter = "rotation", turned, candidate
+                motion, focal_sigma_ratio, fitter = "rotation", turned, candidate
                 found = examine(reprojector, keyframes, graph, adjuster.robust_scale_px)
         usable = keyframes.statics()
         labels = np.full(usable.shape, UNKNOWN, dtype=np.int8)
         if motion == "general":
             usable = np.stack([masks.reliable(k) for k in range(len(keyframes))])
             labels = np.stack([masks.labels(k) for k in range(len(keyframes))])
-        return ShotMap(shot, keyframes, graph, motion, focal, found, loops, adjuster, fitter, usable, labels)
+        return ShotMap(
+            shot, keyframes, graph, motion, focal_sigma_ratio, found, loops, adjuster, fitter, usable, labels
+        )
 
     def _rotation_only(
         self, fitter: RotationFitter, keyframes: KeyframeMap, graph: Graph, prior: FocalPrior, found: MapReport
-    ) -> FocalReport | None:
-        """Replace the map by rotations when they explain the measurements as well as poses and depths do."""
+    ) -> float | None:
+        """Replace the map by rotations when they explain the measurements as well as poses and depths do.
+
+        Returns:
+            The 1-sigma of the focal length as a share of it, or None where the map stays.
+        """
         links = [Link(i, j, graph[i, j], np.ones(keyframes.grid.num_cells, dtype=np.bool_)) for i, j in graph]
         if not links:
             return None
@@ -184,5 +190,4 @@ class ShotMapper:
             keyframes.set_pose(k, pose)
             keyframes.set_depth(k, np.ones(keyframes.grid.num_cells))
             keyframes.set_static(k, np.ones(keyframes.grid.num_cells, dtype=np.bool_))
-        sigma = math.hypot(inflation * fit.log_focal_sigma, self._settings.lens_sigma)
-        return FocalReport(sigma, observed=sigma < prior.sigma)
+        return math.hypot(inflation * fit.log_focal_sigma, self._settings.lens_sigma)

@@ -16,7 +16,6 @@ from vipe_core.errors import ConfigError
 from vipe_core.geometry.arrays import inverse
 from vipe_core.priors.protocols import IntrinsicsEstimate, PriorFamily
 from vipe_core.slam.adjustment import FocalPrior
-from vipe_core.slam.backend import FocalReport
 from vipe_core.slam.diagnostics import LoopReport, MapReport, combine
 from vipe_core.slam.frames import EncodedFrames
 from vipe_core.slam.infill import Trajectory, fill_in
@@ -47,7 +46,7 @@ class SlamResult:
         working: Size of the images that the cells belong to.
         camera: At the working size.
         motion: What kind of camera motion was found in the main shot, the one with most keyframes.
-        focal: What is known of the focal length, from the main shot.
+        focal_sigma_ratio: 1-sigma of the focal length as a share of it, from the main shot.
         map: Diagnostics, with the confidence of every inverse depth.
         loops: What the loop edges of the main shot did.
         timings_s: Wall seconds per stage.
@@ -63,7 +62,7 @@ class SlamResult:
     working: WorkingSize
     camera: Camera
     motion: Motion
-    focal: FocalReport
+    focal_sigma_ratio: float
     map: MapReport
     loops: LoopReport
     timings_s: dict[str, float]
@@ -126,7 +125,7 @@ class Slam:
             working=size,
             camera=Camera.from_index_params("pinhole", maps[main].keyframes.intrinsics, size.width, size.height),
             motion=maps[main].motion,
-            focal=maps[main].focal,
+            focal_sigma_ratio=maps[main].focal_sigma_ratio,
             map=combine([one.found for one in maps]),
             loops=maps[main].loops,
             timings_s=clock.seconds,
