@@ -394,22 +394,20 @@ def _memory(sequence: BenchSequence, settings: DepthSettings) -> int:
     short = _scene(sequence)
     count = len(short.world_from_cam)
     table = Table(title=f"Depth stage, {sequence.name} played forth and back")
-    for heading in ("frames", "CPU-s/frame", "grown to at most, MiB"):
+    for heading in ("frames", "CPU-s/frame", "process at most, MiB"):
         table.add_column(heading, justify="right")
     width = _MEMORY_WIDTH
     height = 8 * round(short.camera.height * width / short.camera.width / 8)
-    peaks = []
     with tempfile.TemporaryDirectory(prefix="vipe-depth-") as folder:
         for length in _LENGTHS:
             source = Looped(open_source(sequence.video), length, (width, height), Path(folder))
             scene = _looped(short, length, count, width, height)
-            first_bytes = peak_bytes = _anonymous_bytes()
+            peak_bytes = 0
             started_s = cpu_s()
             with closing(DenseDepth(settings).stream(source, scene)) as frames:
                 for _ in frames:
                     peak_bytes = max(peak_bytes, _anonymous_bytes())
-            peaks.append((peak_bytes - first_bytes) / 2**20)
-            table.add_row(str(length), f"{(cpu_s() - started_s) / length:.3f}", f"{peaks[-1]:.0f}")
+            table.add_row(str(length), f"{(cpu_s() - started_s) / length:.3f}", f"{peak_bytes / 2**20:.0f}")
     Console(width=100).print(table)
     return 0
 

@@ -21,7 +21,7 @@ Array = NDArray[Any]
 _MIN_SCORE, _SURE_SCORE = 0.2, 0.7
 # A margin over all other depths of the second says as much as it can. An answer without any rests on its neighbours.
 _LEAST_DISTINCT, _SURE_MARGIN = 0.1, 0.2
-# Of the frames that see a pixel, so many must agree, and at least so many.
+# Of the frames that see a pixel, this share must agree, and at least so many; one for what correlates very well.
 _MIN_SHARE, _MIN_VOTES = 0.5, 2
 # What seems to move by itself must convince so many.
 _SURE_VOTES = 3
@@ -86,7 +86,7 @@ def confirm(
             ratios,
         )
     share = votes / np.maximum(asked - hidden, 1)
-    believed = (asked > 0) & (share >= _MIN_SHARE) & (votes >= np.minimum(_MIN_VOTES, asked))
+    believed = (asked > 0) & (share >= _MIN_SHARE) & (votes >= np.where(raw.score > _SURE_SCORE, 1, _MIN_VOTES))
     believed &= ~moving | (votes >= _SURE_VOTES)
     believed = _without_specks(value, believed)
     score = np.clip((raw.score - _MIN_SCORE) / (_SURE_SCORE - _MIN_SCORE), 0, 1)

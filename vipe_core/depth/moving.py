@@ -8,11 +8,12 @@ from numpy.typing import NDArray
 
 # A thing of which so much is measured as static is no moving thing.
 _STATIC_SHARE = 0.2
-# Pixels below a thing that it stands on, and around it.
+# Pixels below a thing that it stands on, or around it.
 _CONTACT_PX = 4
-# It stands as far as the nearer part of what is below it; what the picture cuts off at the bottom, as far as the
-# nearest part of what is around it.
-_BELOW_QUANTILE, _AROUND_QUANTILE = 0.7, 0.95
+# What the picture cuts off at the bottom is as near as the nearer part of what is around it: more of it is in front of
+# the scene than behind it, but a thin neighbour may be nearer still.
+# Of a small piece at the border nobody can tell, and the scene is continued into it.
+_CUT_OFF_QUANTILE, _MIN_CUT_OFF_AREA = 0.8, 0.04
 _MIN_PIXELS = 10
 
 
@@ -40,13 +41,18 @@ def stand(
         if measured[thing].mean() > _STATIC_SHARE:
             continue
         area = thing.astype(np.uint8)
-        bottom = boxes[part, cv2.CC_STAT_TOP] + boxes[part, cv2.CC_STAT_HEIGHT]
-        below = (cv2.dilate(area, lower) > 0) & ~moving
-        # Only under its lower half: what is under an arm is not what it stands on.
-        below[: bottom - boxes[part, cv2.CC_STAT_HEIGHT] // 2] = False
-        around = (cv2.dilate(area, disk) > 0) & ~moving
-        if bottom < height and below.sum() >= _MIN_PIXELS:
-            out[thing] = np.quantile(inverse_depth[below], _BELOW_QUANTILE)
-        elif around.sum() >= _MIN_PIXELS:
-            out[thing] = np.quantile(inverse_depth[around], _AROUND_QUANTILE)
+        tall = int(boxes[part, cv2.CC_STAT_HEIGHT])
+        bottom = int(boxes[part, cv2.CC_STAT_TOP]) + tall
+        if bottom < height:
+            ground = (cv2.dilate(area, lower) > 0) & ~moving
+            # Only under its lower half: what is under an arm is not what it stands on.
+            ground[: bottom - tall // 2] = False
+            nearness = 0.5
+        else:
+            ground = (cv2.dilate(area, disk) > 0) & ~moving
+            nearness = _CUT_OFF_QUANTILE
+            if thing.mean() < _MIN_CUT_OFF_AREA:
+                continue
+        if ground.sum() >= _MIN_PIXELS:
+            out[thing] = np.quantile(inverse_depth[ground], nearness)
     return out
