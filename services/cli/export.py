@@ -72,27 +72,31 @@ def _write(
     voxel: float | None,
     least: float,
 ) -> Path:
-    from vipe_core import formats
+    from vipe_core.formats import export_npz, export_png16
+    from vipe_core.formats.colmap import export_colmap
+    from vipe_core.formats.fused import fuse_cloud, fuse_mesh
+    from vipe_core.formats.nerfstudio import export_nerfstudio
+    from vipe_core.formats.ply import write_ply
 
     match format:
         case "npz":
-            return formats.export_npz(artifacts.root, artifacts.name, out, depth_stride=depth_stride)
+            return export_npz(artifacts.root, artifacts.name, out, depth_stride=depth_stride)
         case "png16":
-            return formats.export_png16(artifacts, out)
+            return export_png16(artifacts, out)
         case "video":
             from vipe_core.rendering.depth_video import export_depth_video
 
             return export_depth_video(artifacts, out, beside_rgb=beside_rgb)
         case "ply":
-            cloud = formats.fuse_cloud(artifacts, voxel=voxel, min_confidence=least, step=step)
-            return formats.write_ply(out, cloud, comments=_comments(artifacts))
+            cloud = fuse_cloud(artifacts, voxel=voxel, min_confidence=least, step=step)
+            return write_ply(out, cloud, comments=_comments(artifacts))
         case "mesh":
-            mesh = formats.fuse_mesh(artifacts, voxel=voxel, min_confidence=least, step=step)
-            return formats.write_ply(out, mesh, comments=_comments(artifacts))
+            mesh = fuse_mesh(artifacts, voxel=voxel, min_confidence=least, step=step)
+            return write_ply(out, mesh, comments=_comments(artifacts))
         case "colmap":
-            return formats.export_colmap(artifacts, out, text=text, step=step, voxel=voxel, min_confidence=least)
+            return export_colmap(artifacts, out, text=text, step=step, voxel=voxel, min_confidence=least)
         case "nerfstudio":
-            return formats.export_nerfstudio(artifacts, out, step=step, voxel=voxel, min_confidence=least)
+            return export_nerfstudio(artifacts, out, step=step, voxel=voxel, min_confidence=least)
 
 
 def _comments(artifacts: Artifacts) -> list[str]:

@@ -17,7 +17,8 @@ from room_artifacts import FILLED_PATCH, MOVING_PATCH, write_room
 
 from vipe_core.annotation import FILLED, MEASURED, MOVING
 from vipe_core.errors import FormatError
-from vipe_core.formats import ConfidenceZipReader, ConfidenceZipWriter, read_artifacts, read_frames, write_artifacts
+from vipe_core.formats import ConfidenceZipReader, ConfidenceZipWriter, read_artifacts, write_artifacts
+from vipe_core.formats.frames import read_frames
 
 
 @settings(max_examples=20, deadline=None)

@@ -15,15 +15,11 @@ from hypothesis import strategies as st
 from room_artifacts import CAMERAS, MOVING_PATCH, write_room
 
 from vipe_core.errors import ExportUnsupported, FormatError
-from vipe_core.formats import (
-    export_colmap,
-    export_nerfstudio,
-    export_png16,
-    fuse_cloud,
-    fuse_mesh,
-    read_png16,
-    write_ply,
-)
+from vipe_core.formats import export_png16, read_png16
+from vipe_core.formats.colmap import export_colmap
+from vipe_core.formats.fused import fuse_cloud, fuse_mesh
+from vipe_core.formats.nerfstudio import export_nerfstudio
+from vipe_core.formats.ply import write_ply
 from vipe_core.formats.png16 import Png16Code
 
 
