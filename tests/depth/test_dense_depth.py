@@ -196,12 +196,20 @@ def test_maps_must_fit_the_camera() -> None:
         SceneMap(camera, poses, keyframes, maps(9), maps(8))
 
 
-def test_same_input_same_bytes(sideways: SyntheticClip, depth_of_sideways: list[DepthFrame]) -> None:
-    again = DenseDepth(SETTINGS).stream(ClipSource(sideways.rgb), scene_of(sideways))
-    for frame, before in zip(again, depth_of_sideways[:3], strict=False):
-        assert frame.depth.tobytes() == before.depth.tobytes()
-        assert frame.confidence.tobytes() == before.confidence.tobytes()
-    again.close()
+@pytest.mark.parametrize("threads", [1, 2])
+def test_same_input_same_bytes_whatever_the_threads(
+    sideways: SyntheticClip, depth_of_sideways: list[DepthFrame], threads: int
+) -> None:
+    before_threads = cv2.getNumThreads()
+    cv2.setNumThreads(threads)
+    try:
+        again = DenseDepth(SETTINGS).stream(ClipSource(sideways.rgb), scene_of(sideways))
+        for frame, before in zip(again, depth_of_sideways[:3], strict=False):
+            assert frame.depth.tobytes() == before.depth.tobytes()
+            assert frame.confidence.tobytes() == before.confidence.tobytes()
+        again.close()
+    finally:
+        cv2.setNumThreads(before_threads)
 
 
 def test_every_pixel_says_where_its_depth_comes_from(

@@ -15,6 +15,7 @@ from typing import Any
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import distance_transform_edt
 
 from vipe_core.ba.problem import Grid
 from vipe_core.depth.completion import complete
@@ -167,7 +168,8 @@ class DenseDepth:
             settings.fill_tolerance,
         )
         value = stand(value, picture.moving, measured)
-        away_px = cv2.distanceTransform((~measured).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+        # OpenCV's differs in the last bit with the number of its threads.
+        away_px = distance_transform_edt(~measured)
         reach_px = _FILL_REACH * sky.shape[1]
         confidence = np.where(measured, found.belief, _FILL_CONFIDENCE * np.exp(-away_px / reach_px))
         kind = np.where(measured, MEASURED, np.where(away_px < _LOST_REACH * reach_px, FILLED, UNOBSERVED))

@@ -12,6 +12,7 @@ from typing import Any
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import distance_transform_edt
 
 from vipe_core.ba.problem import Grid
 from vipe_core.priors.protocols import Match
@@ -88,9 +89,6 @@ def _leaning(cells: Array, moving: Array) -> NDArray[np.bool_]:
     if not static.any() or not (cells == MOVING).any():
         return np.zeros(cells.shape, dtype=np.bool_)
     around = cv2.GaussianBlur(moving - np.where(static, np.float32(1), 0), (0, 0), _REACH_CELLS) > 0
-    to_moving, to_static = (
-        cv2.distanceTransform((cells != label).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
-        for label in (MOVING, STATIC)
-    )
+    to_moving, to_static = (distance_transform_edt(cells != label) for label in (MOVING, STATIC))
     nearest = cv2.morphologyEx((to_moving < to_static).astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
     return np.asarray(around | (nearest > 0), dtype=np.bool_)
