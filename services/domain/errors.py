@@ -77,6 +77,34 @@ class InputUnavailable(ServiceError):
     status = 422
 
 
+class AddressRefused(ServiceError):
+    """A URL or an address that the operator does not let users name."""
+
+    code = "address_refused"
+    status = 422
+
+
+class InputTooLarge(ServiceError):
+    """An input has more bytes, rows or members than the settings allow."""
+
+    code = "input_too_large"
+    status = 422
+
+
+class HttpFailed(ServiceError):
+    """A web server did not answer, or broke off."""
+
+    code = "http_failed"
+    status = 503
+    retryable = True
+
+
+class NameUnresolved(HttpFailed):
+    """The name of a host has no address, now."""
+
+    code = "name_unresolved"
+
+
 class StorageError(ServiceError):
     """The object store refused or did not answer."""
 
