@@ -2,37 +2,21 @@
 
 from __future__ import annotations
 
-import secrets
 import threading
 from collections.abc import Callable
-from typing import Annotated, Any
+from typing import Any
 
-from fastapi import APIRouter, Depends, FastAPI, Request, Response
+from fastapi import APIRouter, FastAPI, Request, Response
 from fastapi.openapi.utils import get_openapi
-from fastapi.security import HTTPAuthorizationCredentials, HTTPBearer
 
 from services.api import problems, routes
 from services.api.middleware import BodyLimit, LoopbackHost, RequestContext, is_loopback
-from services.api.problems import Problem, Unauthorized
+from services.api.problems import Problem
 from services.api.schemas import Readiness, Status
 from services.domain.errors import StoreUnavailable
 from services.observability.metrics import CONTENT_TYPE, Metrics, package_version
 from services.settings import Settings
 from services.store.base import Store
-
-_bearer = HTTPBearer(auto_error=False, description="The service's `api_key`, where one is set.")
-
-
-def authenticate(
-    request: Request, credentials: Annotated[HTTPAuthorizationCredentials | None, Depends(_bearer)]
-) -> None:
-    """Raises Unauthorized unless the request carries the service's key (or the service has none)."""
-    settings: Settings = request.app.state.settings
-    if settings.api_key is None:
-        return
-    given = "" if credentials is None else credentials.credentials
-    if not secrets.compare_digest(given.encode(), settings.api_key.get_secret_value().encode()):
-        raise Unauthorized("send the service's key as `Authorization: Bearer <key>`")
 
 
 def create_app(
@@ -67,7 +51,7 @@ def create_app(
     if settings.api_key is None and is_loopback(settings.host):
         app.add_middleware(LoopbackHost)
     app.add_middleware(RequestContext, metrics=metrics)
-    app.include_router(routes.router, dependencies=[Depends(authenticate)])
+    app.include_router(routes.router)
     app.include_router(_operations)
     _document_problems(app)
     return app

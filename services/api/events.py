@@ -34,20 +34,20 @@ def wants_stream(accept: str) -> bool:
     return "text/event-stream" in accept or "application/json" not in accept
 
 
-def event_page(store: Store, job_id: str, *, limit: int, page_token: str | None) -> EventPage:
+def event_page(store: Store, job_id: str, *, tenant: str, limit: int, page_token: str | None) -> EventPage:
     """One page of the history, oldest first."""
     name = f"events of {job_id}"
     after = paging.cursor(page_token, of=name) or "0"
     if not after.isascii() or not after.isdigit() or len(after) > 18:
         raise InvalidPageToken("this page_token was not given out for this list; start again without one")
-    events = store.events(job_id, after_seq=int(after), limit=limit + 1)
+    events = store.events(job_id, tenant=tenant, after_seq=int(after), limit=limit + 1)
     more = len(events) > limit
     events = events[:limit]
     following = paging.token(str(events[-1].seq), of=name) if more else None
     return EventPage(items=[EventView.of(event) for event in events], next_page_token=following)
 
 
-def event_stream(store: Store, job_id: str, *, after_seq: int, draining: threading.Event) -> Response:
+def event_stream(store: Store, job_id: str, *, tenant: str, after_seq: int, draining: threading.Event) -> Response:
     """The history behind `after_seq` and everything that follows until the job has ended or the server drains.
 
     A reader who knows the last event already gets 204, which tells an `EventSource` not to come back.
@@ -55,8 +55,8 @@ def event_stream(store: Store, job_id: str, *, after_seq: int, draining: threadi
     Raises:
         JobNotFound: There is no such job (before the stream begins).
     """
-    job = store.get_job(job_id)
-    first = store.events(job_id, after_seq=after_seq, limit=_BATCH)
+    job = store.get_job(job_id, tenant=tenant)
+    first = store.events(job_id, tenant=tenant, after_seq=after_seq, limit=_BATCH)
     if job.state.terminal and not first:  # The job was read first, so its last event would be there.
         return Response(status_code=204)
     # Without an event of its own and some grace, the library cuts streams off when the server stops.
@@ -94,8 +94,8 @@ async def _follow(
             await anyio.sleep(_POLL_S)
         polls += 1
         try:
-            job = await run_sync(store.get_job, job.id)
-            events = await run_sync(partial(store.events, job.id, after_seq=seq, limit=_BATCH))
+            job = await run_sync(partial(store.get_job, job.id, tenant=job.tenant))
+            events = await run_sync(partial(store.events, job.id, tenant=job.tenant, after_seq=seq, limit=_BATCH))
         except StoreUnavailable as error:
             _log.warning("event stream of %s ends: %s", job.id, error)
             return

@@ -28,6 +28,13 @@ class Unauthorized(ServiceError):
     status = 401
 
 
+class Forbidden(ServiceError):
+    """The key is known, but it lacks the scope that the route needs."""
+
+    code = "forbidden"
+    status = 403
+
+
 class UnsupportedMediaType(ServiceError):
     code = "unsupported_media_type"
     status = 415

@@ -9,6 +9,7 @@ from fastapi import APIRouter, Depends, Header, Path, Query, Request, Response
 from pydantic import AfterValidator
 
 from services.api import paging
+from services.api.authentication import Reader, Writer
 from services.api.events import LAST_EVENT_ID, event_page, event_stream, wants_stream
 from services.api.problems import UnsupportedMediaType, responses
 from services.api.schemas import (
@@ -70,11 +71,12 @@ router = APIRouter(prefix="/v1/jobs", tags=["jobs"])
                 },
             },
         },
-        **responses(400, 401, 409, 413, 415, 422, 503),
+        **responses(400, 401, 403, 409, 413, 415, 422, 503),
     },
 )
 def create_job(
     body: JobRequest,
+    caller: Writer,
     store: TheStore,
     request: Request,
     response: Response,
@@ -86,7 +88,7 @@ def create_job(
     """Create a job. Sent again with the same `Idempotency-Key` and body, it answers with the job of the first time."""
     spec = body.to_spec()
     _check_output(spec.output, request.app.state.settings.output_roots)
-    job, created = store.create_job(spec, idempotency_key=idempotency_key)
+    job, created = store.create_job(spec, tenant=caller.tenant, idempotency_key=idempotency_key)
     response.headers["Location"] = f"/v1/jobs/{job.id}"
     if not created:
         response.headers["Idempotent-Replayed"] = "true"
@@ -103,30 +105,32 @@ def _check_output(output: str, roots: tuple[FilePath, ...]) -> None:
         raise InvalidRequest(f"output {output} lies outside of the directories that this service may write")
 
 
-@router.get("", responses=responses(400, 401, 422, 503))
+@router.get("", responses=responses(400, 401, 403, 422, 503))
 def list_jobs(
-    store: TheStore, limit: Limit = 50, page_token: PageToken = None, state: JobState | None = None
+    caller: Reader, store: TheStore, limit: Limit = 50, page_token: PageToken = None, state: JobState | None = None
 ) -> JobPage:
     """List jobs, newest first."""
-    jobs, after = store.list_jobs(limit=limit, after=paging.cursor(page_token, of="jobs"), state=state)
+    after = paging.cursor(page_token, of="jobs")
+    jobs, after = store.list_jobs(tenant=caller.tenant, limit=limit, after=after, state=state)
     return JobPage(items=[JobView.of(job) for job in jobs], next_page_token=paging.token(after, of="jobs"))
 
 
-@router.get("/{job_id}", responses=responses(401, 404, 422, 503))
-def get_job(job_id: JobId, store: TheStore) -> JobView:
+@router.get("/{job_id}", responses=responses(401, 403, 404, 422, 503))
+def get_job(job_id: JobId, caller: Reader, store: TheStore) -> JobView:
     """Show a job and its progress."""
-    return JobView.of(store.get_job(job_id))
+    return JobView.of(store.get_job(job_id, tenant=caller.tenant))
 
 
-@router.post("/{job_id}/cancel", status_code=202, responses=responses(401, 404, 409, 422, 503))
-def cancel_job(job_id: JobId, store: TheStore) -> JobView:
+@router.post("/{job_id}/cancel", status_code=202, responses=responses(401, 403, 404, 409, 422, 503))
+def cancel_job(job_id: JobId, caller: Writer, store: TheStore) -> JobView:
     """Cancel a job. What is committed stays; work under way is stopped, and the job is cancelled when it has."""
-    return JobView.of(store.request_cancel(job_id))
+    return JobView.of(store.request_cancel(job_id, tenant=caller.tenant))
 
 
-@router.get("/{job_id}/videos", responses=responses(400, 401, 404, 422, 503))
+@router.get("/{job_id}/videos", responses=responses(400, 401, 403, 404, 422, 503))
 def list_videos(
     job_id: JobId,
+    caller: Reader,
     store: TheStore,
     status: VideoStatus | None = None,
     error_code: Annotated[str | None, Query(max_length=64, pattern=r"^[a-z0-9_]+$")] = None,
@@ -136,15 +140,20 @@ def list_videos(
     """List the videos of a job with their results, by key."""
     name = f"videos of {job_id}"
     after = paging.cursor(page_token, of=name)
-    rows, after = store.list_videos(job_id, status=status, error_code=error_code, limit=limit, after=after)
+    rows, after = store.list_videos(
+        job_id, tenant=caller.tenant, status=status, error_code=error_code, limit=limit, after=after
+    )
     return VideoPage(items=[VideoView.of(row) for row in rows], next_page_token=paging.token(after, of=name))
 
 
-@router.get("/{job_id}/shards", responses=responses(400, 401, 404, 422, 503))
-def list_shards(job_id: JobId, store: TheStore, limit: Limit = 100, page_token: PageToken = None) -> ShardPage:
+@router.get("/{job_id}/shards", responses=responses(400, 401, 403, 404, 422, 503))
+def list_shards(
+    job_id: JobId, caller: Reader, store: TheStore, limit: Limit = 100, page_token: PageToken = None
+) -> ShardPage:
     """List the shards of a job, in order."""
     name = f"shards of {job_id}"
-    shards, after = store.list_shards(job_id, limit=limit, after=paging.cursor(page_token, of=name))
+    after = paging.cursor(page_token, of=name)
+    shards, after = store.list_shards(job_id, tenant=caller.tenant, limit=limit, after=after)
     return ShardPage(items=[ShardView.of(s) for s in shards], next_page_token=paging.token(after, of=name))
 
 
@@ -159,12 +168,13 @@ def list_shards(job_id: JobId, store: TheStore, limit: Limit = 100, page_token: 
         204: {
             "description": "The job has ended, and `Last-Event-ID` names its last event: there is nothing to follow."
         },
-        **responses(400, 401, 404, 422, 503),
+        **responses(400, 401, 403, 404, 422, 503),
     },
 )
 def list_events(
     request: Request,
     job_id: JobId,
+    caller: Reader,
     store: TheStore,
     limit: Limit = 100,
     page_token: PageToken = None,
@@ -179,5 +189,6 @@ def list_events(
     that has ended. Reconnect with `Last-Event-ID` to miss nothing.
     """
     if wants_stream(request.headers.get("accept", "")):
-        return event_stream(store, job_id, after_seq=int(last_event_id or 0), draining=request.app.state.draining)
-    return event_page(store, job_id, limit=limit, page_token=page_token)
+        draining = request.app.state.draining
+        return event_stream(store, job_id, tenant=caller.tenant, after_seq=int(last_event_id or 0), draining=draining)
+    return event_page(store, job_id, tenant=caller.tenant, limit=limit, page_token=page_token)

@@ -2,6 +2,9 @@
 
 Implemented once with SQLAlchemy for SQLite and PostgreSQL. All methods are synchronous and thread-safe. Times are the
 database's clock, UTC.
+
+Methods that callers of the API reach take `tenant`: given, the jobs of other tenants do not exist for the call
+(JobNotFound, left out of lists). None is the service itself, which sees all of them.
 """
 
 from __future__ import annotations
@@ -64,15 +67,20 @@ class Store(Protocol):
                 that failed or was cancelled before it had shards frees it.
         """
 
-    def get_job(self, job_id: str) -> Job:
+    def get_job(self, job_id: str, *, tenant: str | None = None) -> Job:
         """With progress. Raises JobNotFound."""
 
     def list_jobs(
-        self, *, limit: int = 50, after: str | None = None, state: JobState | None = None
+        self,
+        *,
+        tenant: str | None = None,
+        limit: int = 50,
+        after: str | None = None,
+        state: JobState | None = None,
     ) -> tuple[list[Job], str | None]:
         """Newest first, and the cursor of the next page."""
 
-    def request_cancel(self, job_id: str) -> Job:
+    def request_cancel(self, job_id: str, *, tenant: str | None = None) -> Job:
         """Move to cancelling (a job without live leases is cancelled at once). Raises JobNotCancellable when ended."""
 
     # Planning -------------------------------------------------------------------------------------------------------
@@ -186,6 +194,7 @@ class Store(Protocol):
         self,
         job_id: str,
         *,
+        tenant: str | None = None,
         status: VideoStatus | None = None,
         error_code: str | None = None,
         limit: int = 100,
@@ -194,13 +203,15 @@ class Store(Protocol):
         """In the order of their keys, and the cursor of the next page."""
 
     def list_shards(
-        self, job_id: str, *, limit: int = 100, after: str | None = None
+        self, job_id: str, *, tenant: str | None = None, limit: int = 100, after: str | None = None
     ) -> tuple[list[Shard], str | None]: ...
 
     def uncommitted_shards(self, job_id: str) -> list[Shard]:
         """Shards that are not committed, for the reconciler that compares with the records in object storage."""
 
-    def events(self, job_id: str, *, after_seq: int = 0, limit: int = 1000) -> list[Event]: ...
+    def events(
+        self, job_id: str, *, tenant: str | None = None, after_seq: int = 0, limit: int = 1000
+    ) -> list[Event]: ...
 
     def counts(self) -> dict[str, dict[str, int]]:
         """{"jobs": {state: n}, "shards": {state: n}} for the gauges."""

@@ -30,14 +30,19 @@ NO_FAILURES: dict[str, Any] = {"failures": 0, "failing_since": None, "not_before
 _MAX_DOUBLINGS = 64
 
 
-def lock_job(tx: Tx, job_id: str) -> Row[Any]:
+def owns(tenant: str | None, job: Row[Any]) -> bool:
+    """Whether a job exists for a tenant; None is the service itself."""
+    return tenant is None or bool(job.tenant == tenant)
+
+
+def lock_job(tx: Tx, job_id: str, tenant: str | None = None) -> Row[Any]:
     """Read a job's row for a change. Whoever changes a job's shards or counters takes this lock first.
 
     It is the lock that lets rows refer to the job meanwhile (`FOR NO KEY UPDATE`): a claim, which locks shards only,
     can write its event.
     """
     row = tx.first(select(jobs).where(jobs.c.id == job_id).with_for_update(key_share=True))
-    if row is None:
+    if row is None or not owns(tenant, row):
         raise JobNotFound(f"there is no job {job_id!r}")
     return row
 
@@ -90,10 +95,13 @@ def create_job(tx: Tx, spec: JobSpec, tenant: str, idempotency_key: str | None) 
             return known.job_id, False
     output = canonical_output(spec.output)
     ended_without_a_trace = and_(jobs.c.state.in_([JobState.FAILED, JobState.CANCELLED]), jobs.c.shards_total == 0)
-    owner = tx.first(select(jobs.c.id, jobs.c.state).where(jobs.c.output == output, ~ended_without_a_trace))
+    owner = tx.first(
+        select(jobs.c.id, jobs.c.state, jobs.c.tenant).where(jobs.c.output == output, ~ended_without_a_trace)
+    )
     if owner is not None:
+        whose = f"job {owner.id} ({owner.state})" if owns(tenant, owner) else "a job of another tenant"
         raise OutputInUse(
-            f"output {spec.output!r} belongs to job {owner.id} ({owner.state}), "
+            f"output {spec.output!r} belongs to {whose}, "
             "and stays with the first job that wrote to it; choose another folder"
         )
 
@@ -128,9 +136,9 @@ def _next_id(tx: Tx) -> str:
     return f"job_{ULID.from_datetime(moment)}"
 
 
-def request_cancel(tx: Tx, job_id: str) -> None:
+def request_cancel(tx: Tx, job_id: str, tenant: str | None) -> None:
     """See `Store.request_cancel`."""
-    job = lock_job(tx, job_id)
+    job = lock_job(tx, job_id, tenant)
     state = JobState(job.state)
     if state is JobState.CANCELLING:
         return

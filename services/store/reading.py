@@ -20,23 +20,28 @@ from services.domain.models import (
 from services.domain.states import JobState, ShardState, VideoStatus
 from services.store.base import VideoRow
 from services.store.database import Tx
+from services.store.jobs import owns
 from services.store.schema import events, in_state, jobs, shards, videos
 
 # The recent past over which frames per second are counted.
 _RATE_WINDOW_S = 120.0
 
 
-def get_job(tx: Tx, job_id: str) -> Job:
+def get_job(tx: Tx, job_id: str, tenant: str | None = None) -> Job:
     """See `Store.get_job`."""
     row = tx.first(select(jobs).where(jobs.c.id == job_id))
-    if row is None:
+    if row is None or not owns(tenant, row):
         raise JobNotFound(f"there is no job {job_id!r}")
     return _job(tx, row)
 
 
-def list_jobs(tx: Tx, limit: int, after: str | None, state: JobState | None) -> tuple[list[Job], str | None]:
+def list_jobs(
+    tx: Tx, tenant: str | None, limit: int, after: str | None, state: JobState | None
+) -> tuple[list[Job], str | None]:
     """See `Store.list_jobs`."""
     query = select(jobs).order_by(jobs.c.id.desc())
+    if tenant is not None:
+        query = query.where(jobs.c.tenant == tenant)
     if after is not None:
         query = query.where(jobs.c.id < after)
     if state is not None:
@@ -81,10 +86,16 @@ def _has_its_turn(now: datetime) -> ColumnElement[bool]:
 
 
 def list_videos(
-    tx: Tx, job_id: str, status: VideoStatus | None, error_code: str | None, limit: int, after: str | None
+    tx: Tx,
+    job_id: str,
+    tenant: str | None,
+    status: VideoStatus | None,
+    error_code: str | None,
+    limit: int,
+    after: str | None,
 ) -> tuple[list[VideoRow], str | None]:
     """See `Store.list_videos`."""
-    _require_job(tx, job_id)
+    _require_job(tx, job_id, tenant)
     query = select(videos).where(videos.c.job_id == job_id).order_by(videos.c.key)
     if after is not None:
         query = query.where(videos.c.key > after)
@@ -105,9 +116,11 @@ def list_videos(
     return found, cursor
 
 
-def list_shards(tx: Tx, job_id: str, limit: int, after: str | None) -> tuple[list[Shard], str | None]:
+def list_shards(
+    tx: Tx, job_id: str, tenant: str | None, limit: int, after: str | None
+) -> tuple[list[Shard], str | None]:
     """See `Store.list_shards`."""
-    _require_job(tx, job_id)
+    _require_job(tx, job_id, tenant)
     query = select(shards).where(shards.c.job_id == job_id).order_by(shards.c.ordinal)
     if after is not None:
         if not after.isascii() or not after.isdigit() or len(after) > 9:
@@ -123,9 +136,9 @@ def uncommitted_shards(tx: Tx, job_id: str) -> list[Shard]:
     return [_shard(row) for row in tx.rows(query.order_by(shards.c.ordinal))]
 
 
-def list_events(tx: Tx, job_id: str, after_seq: int, limit: int) -> list[Event]:
+def list_events(tx: Tx, job_id: str, tenant: str | None, after_seq: int, limit: int) -> list[Event]:
     """See `Store.events`."""
-    _require_job(tx, job_id)
+    _require_job(tx, job_id, tenant)
     query = select(events).where(events.c.job_id == job_id, events.c.seq > after_seq).order_by(events.c.seq)
     return [Event(e.seq, e.job_id, e.at, e.kind, e.data) for e in tx.rows(query.limit(limit))]
 
@@ -149,8 +162,9 @@ def _page(tx: Tx, query: Select[Any], limit: int, cursor_column: str) -> tuple[l
     return rows[:limit], str(getattr(rows[limit - 1], cursor_column))
 
 
-def _require_job(tx: Tx, job_id: str) -> None:
-    if tx.first(select(jobs.c.id).where(jobs.c.id == job_id)) is None:
+def _require_job(tx: Tx, job_id: str, tenant: str | None) -> None:
+    row = tx.first(select(jobs.c.tenant).where(jobs.c.id == job_id))
+    if row is None or not owns(tenant, row):
         raise JobNotFound(f"there is no job {job_id!r}")
 
 

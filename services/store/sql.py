@@ -51,16 +51,21 @@ class SqlStore:
         job_id, created = self._db.write(lambda tx: jobs.create_job(tx, spec, tenant, idempotency_key))
         return self.get_job(job_id), created
 
-    def get_job(self, job_id: str) -> Job:
-        return self._db.read(lambda tx: reading.get_job(tx, job_id))
+    def get_job(self, job_id: str, *, tenant: str | None = None) -> Job:
+        return self._db.read(lambda tx: reading.get_job(tx, job_id, tenant))
 
     def list_jobs(
-        self, *, limit: int = 50, after: str | None = None, state: JobState | None = None
+        self,
+        *,
+        tenant: str | None = None,
+        limit: int = 50,
+        after: str | None = None,
+        state: JobState | None = None,
     ) -> tuple[list[Job], str | None]:
-        return self._db.read(lambda tx: reading.list_jobs(tx, limit, after, state))
+        return self._db.read(lambda tx: reading.list_jobs(tx, tenant, limit, after, state))
 
-    def request_cancel(self, job_id: str) -> Job:
-        self._db.write(lambda tx: jobs.request_cancel(tx, job_id))
+    def request_cancel(self, job_id: str, *, tenant: str | None = None) -> Job:
+        self._db.write(lambda tx: jobs.request_cancel(tx, job_id, tenant))
         return self.get_job(job_id)
 
     # Planning -------------------------------------------------------------------------------------------------------
@@ -135,21 +140,24 @@ class SqlStore:
         self,
         job_id: str,
         *,
+        tenant: str | None = None,
         status: VideoStatus | None = None,
         error_code: str | None = None,
         limit: int = 100,
         after: str | None = None,
     ) -> tuple[list[VideoRow], str | None]:
-        return self._db.read(lambda tx: reading.list_videos(tx, job_id, status, error_code, limit, after))
+        return self._db.read(lambda tx: reading.list_videos(tx, job_id, tenant, status, error_code, limit, after))
 
-    def list_shards(self, job_id: str, *, limit: int = 100, after: str | None = None) -> tuple[list[Shard], str | None]:
-        return self._db.read(lambda tx: reading.list_shards(tx, job_id, limit, after))
+    def list_shards(
+        self, job_id: str, *, tenant: str | None = None, limit: int = 100, after: str | None = None
+    ) -> tuple[list[Shard], str | None]:
+        return self._db.read(lambda tx: reading.list_shards(tx, job_id, tenant, limit, after))
 
     def uncommitted_shards(self, job_id: str) -> list[Shard]:
         return self._db.read(lambda tx: reading.uncommitted_shards(tx, job_id))
 
-    def events(self, job_id: str, *, after_seq: int = 0, limit: int = 1000) -> list[Event]:
-        return self._db.read(lambda tx: reading.list_events(tx, job_id, after_seq, limit))
+    def events(self, job_id: str, *, tenant: str | None = None, after_seq: int = 0, limit: int = 1000) -> list[Event]:
+        return self._db.read(lambda tx: reading.list_events(tx, job_id, tenant, after_seq, limit))
 
     def counts(self) -> dict[str, dict[str, int]]:
         return self._db.read(reading.counts)

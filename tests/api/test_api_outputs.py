@@ -11,9 +11,12 @@ from starlette.responses import Response
 from services.api import create_app
 from services.api.routes import create_job
 from services.api.schemas import JobRequest
+from services.domain.access import ALL_SCOPES, DEFAULT_TENANT, Caller
 from services.domain.errors import InvalidRequest
 from services.settings import Settings
 from services.store.sql import SqlStore
+
+CALLER = Caller(DEFAULT_TENANT, None, ALL_SCOPES)
 
 
 def test_outputs_outside_of_the_roots_are_refused_at_once(tmp_path: Path) -> None:
@@ -22,7 +25,7 @@ def test_outputs_outside_of_the_roots_are_refused_at_once(tmp_path: Path) -> Non
     request = Request({"type": "http", "app": app})
 
     def post(output: str) -> str:
-        return create_job(JobRequest(inputs=["/videos"], output=output), store, request, Response()).id
+        return create_job(JobRequest(inputs=["/videos"], output=output), CALLER, store, request, Response()).id
 
     for output in (str(tmp_path / "elsewhere"), str(tmp_path / "allowed-not")):
         with pytest.raises(InvalidRequest, match="outside"):

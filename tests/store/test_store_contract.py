@@ -45,6 +45,23 @@ class TestJobs:
             with pytest.raises(JobNotFound, match="job_x"):
                 call("job_x")
 
+    def test_a_tenant_sees_its_own_jobs_only(self, store: SqlStore) -> None:
+        mine, _ = store.create_job(spec("/mine"), tenant="a")
+        theirs, _ = store.create_job(spec("/theirs"), tenant="b")
+        for call in (store.get_job, store.request_cancel, store.list_videos, store.list_shards, store.events):
+            with pytest.raises(JobNotFound):
+                call(theirs.id, tenant="a")
+            call(mine.id, tenant="a")
+            call(theirs.id)
+        assert store.get_job(theirs.id).state is JobState.CANCELLED, "by the service itself"
+        assert [job.id for job in store.list_jobs(tenant="a")[0]] == [mine.id]
+        assert [job.id for job in store.list_jobs(tenant="a", state=JobState.CANCELLED)[0]] == [mine.id]
+        assert len(store.list_jobs()[0]) == 2
+        owner, _ = store.create_job(spec("/shared"), tenant="b")
+        with pytest.raises(OutputInUse, match="another tenant") as refused:
+            store.create_job(spec("/shared"), tenant="a")
+        assert owner.id not in str(refused.value)
+
     def test_the_same_key_gives_the_same_job(self, store: SqlStore) -> None:
         first, created = store.create_job(spec(), idempotency_key="k")
         again, created_again = store.create_job(spec(), idempotency_key="k")
