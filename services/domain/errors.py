@@ -70,6 +70,19 @@ class IdempotencyConflict(ServiceError):
     status = 422
 
 
+class IdempotencyInFlight(ServiceError):
+    """A request with the same `Idempotency-Key` is being worked on."""
+
+    code = "idempotency_in_flight"
+    status = 409
+    retryable = True
+
+
+class KeyNotFound(ServiceError):
+    code = "key_not_found"
+    status = 404
+
+
 class InputUnavailable(ServiceError):
     """An input cannot be listed or fetched: it does not exist, or access is denied."""
 

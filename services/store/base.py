@@ -13,6 +13,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
+from services.domain.access import ALL_SCOPES, DEFAULT_TENANT, ApiKey, AuditEntry, AuditEvent, Scope
 from services.domain.models import (
     CommitRecord,
     Event,
@@ -57,12 +58,24 @@ class Deferral:
 class Store(Protocol):
     # Jobs -----------------------------------------------------------------------------------------------------------
     def create_job(
-        self, spec: JobSpec, *, tenant: str = "default", idempotency_key: str | None = None
+        self,
+        spec: JobSpec,
+        *,
+        tenant: str = DEFAULT_TENANT,
+        idempotency_key: str | None = None,
+        request_hash: str | None = None,
     ) -> tuple[Job, bool]:
-        """A new queued job and True; or, for a known key with the same spec, that job and False.
+        """A new queued job and True; or, for a key that the tenant used within 7 days, the job as it was, and False.
+
+        Args:
+            spec: What to do.
+            tenant: Whose job it is.
+            idempotency_key: Kept in the transaction that creates the job.
+            request_hash: What the key stands for; default: the spec.
 
         Raises:
-            IdempotencyConflict: The key was used with another spec.
+            IdempotencyConflict: The key was used with another request.
+            IdempotencyInFlight: A request with this key is being worked on.
             OutputInUse: An earlier job has the same output. An output stays with its first job for ever; only a job
                 that failed or was cancelled before it had shards frees it.
         """
@@ -188,6 +201,38 @@ class Store(Protocol):
 
     def finish_sweep(self, job_id: str) -> None:
         """`next_unswept` names this job no more."""
+
+    # Access ---------------------------------------------------------------------------------------------------------
+    def create_key(
+        self,
+        name: str,
+        *,
+        tenant: str = DEFAULT_TENANT,
+        scopes: frozenset[Scope] = ALL_SCOPES,
+        expires_in_s: float | None = None,
+    ) -> tuple[ApiKey, str]:
+        """A new key, without its secret and as the text that its owner uses; the text is not kept."""
+
+    def find_key(self, key_id: str) -> tuple[ApiKey, str, bool] | None:
+        """A key, the hash to hold it against, and whether it is neither revoked nor expired; None if unknown."""
+
+    def list_keys(
+        self, *, tenant: str | None = None, limit: int = 100, after: str | None = None
+    ) -> tuple[list[ApiKey], str | None]:
+        """In the order of their ids, and the cursor of the next page."""
+
+    def revoke_key(self, key_id: str, *, tenant: str | None = None) -> ApiKey:
+        """End a key for ever; revoking twice is no error. Raises KeyNotFound."""
+
+    def touch_key(self, key_id: str) -> None:
+        """Note that a key is in use, to the minute."""
+
+    def record_audit(self, entries: Sequence[AuditEntry]) -> None:
+        """Add to the audit trail."""
+
+    def audit(self, tenant: str, *, limit: int = 100, after: str | None = None) -> tuple[list[AuditEvent], str | None]:
+        """A tenant's trail, newest first, and the cursor of the next page; with what belongs to nobody for `default`,
+        the tenant of who runs the service."""
 
     # Reading --------------------------------------------------------------------------------------------------------
     def list_videos(

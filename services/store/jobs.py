@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 import posixpath
 from datetime import datetime, timedelta
 from typing import Any
@@ -11,13 +9,13 @@ from typing import Any
 from sqlalchemy import Row, and_, func, insert, select, update
 from ulid import ULID
 
-from services.domain.errors import IdempotencyConflict, InvalidTransition, JobNotCancellable, JobNotFound, OutputInUse
+from services.domain.errors import InvalidTransition, JobNotCancellable, JobNotFound, OutputInUse
 from services.domain.events import EventKind, job_event
 from services.domain.models import JobSpec
 from services.domain.states import JOB_TRANSITIONS, JobState, ShardState
 from services.store.base import Deferral
 from services.store.database import Tx
-from services.store.schema import idempotency_keys, in_state, jobs, shards
+from services.store.schema import in_state, jobs, shards
 
 # Serialises the creation of jobs in PostgreSQL, so that ids grow and the check of the output cannot be overtaken.
 _CREATE_LOCK = 0x6A6F6273
@@ -75,24 +73,14 @@ def canonical_output(output: str) -> str:
     return posixpath.normpath(output)
 
 
-def create_job(tx: Tx, spec: JobSpec, tenant: str, idempotency_key: str | None) -> tuple[str, bool]:
-    """See `Store.create_job`; gives the id."""
+def create_job(tx: Tx, spec: JobSpec, tenant: str) -> str:
+    """A new job; gives its id.
+
+    Raises:
+        OutputInUse: See `Store.create_job`.
+    """
     if tx.conn.dialect.name == "postgresql":
         tx.run(select(func.pg_advisory_xact_lock(_CREATE_LOCK)))
-    document = spec.to_json()
-    spec_hash = hashlib.sha256(json.dumps(document, sort_keys=True).encode()).hexdigest()
-    if idempotency_key is not None:
-        known = tx.first(
-            select(idempotency_keys).where(
-                idempotency_keys.c.tenant == tenant, idempotency_keys.c.key == idempotency_key
-            )
-        )
-        if known is not None:
-            if known.spec_hash != spec_hash:
-                raise IdempotencyConflict(
-                    f"Idempotency-Key {idempotency_key!r} was used with another request; use a new key"
-                )
-            return known.job_id, False
     output = canonical_output(spec.output)
     ended_without_a_trace = and_(jobs.c.state.in_([JobState.FAILED, JobState.CANCELLED]), jobs.c.shards_total == 0)
     owner = tx.first(
@@ -110,21 +98,15 @@ def create_job(tx: Tx, spec: JobSpec, tenant: str, idempotency_key: str | None) 
         insert(jobs).values(
             id=job_id,
             tenant=tenant,
-            spec=document,
+            spec=spec.to_json(),
             output=output,
             state=JobState.QUEUED.value,
             created_at=tx.now,
             updated_at=tx.now,
         )
     )
-    if idempotency_key is not None:
-        tx.run(
-            insert(idempotency_keys).values(
-                tenant=tenant, key=idempotency_key, spec_hash=spec_hash, job_id=job_id, created_at=tx.now
-            )
-        )
     tx.emit(job_id, EventKind.JOB_QUEUED, name=spec.name)
-    return job_id, True
+    return job_id
 
 
 def _next_id(tx: Tx) -> str:

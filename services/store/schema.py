@@ -113,6 +113,7 @@ jobs = Table(
     _count("frames_committed"),
     _one_of("state", JobState),
     Index("ix_jobs_state_id", "state", "id"),
+    Index("ix_jobs_tenant_id", "tenant", "id"),
     Index("ix_jobs_unswept", "id", sqlite_where=text("swept = 0"), postgresql_where=text("NOT swept")),
     # An output belongs to one job; one that ended before it had shards has left no trace in it.
     Index(
@@ -129,9 +130,43 @@ idempotency_keys = Table(
     metadata,
     Column("tenant", String(64), primary_key=True),
     Column("key", String(255), primary_key=True),
-    Column("spec_hash", String(64), nullable=False),
-    Column("job_id", ForeignKey("jobs.id", ondelete="CASCADE"), nullable=False),
+    Column("request_hash", String(64), nullable=False),
+    Column("answer", Json, nullable=False),
     Column("created_at", UtcDateTime, nullable=False),
+    Index("ix_idempotency_keys_created_at", "created_at"),
+)
+
+api_keys = Table(
+    "api_keys",
+    metadata,
+    Column("id", String(16), primary_key=True),
+    Column("tenant", String(64), nullable=False),
+    Column("name", String(200), nullable=False),
+    Column("hash", String(255), nullable=False),
+    Column("scopes", Json, nullable=False),
+    Column("created_at", UtcDateTime, nullable=False),
+    Column("expires_at", UtcDateTime),
+    Column("revoked_at", UtcDateTime),
+    Column("last_used_at", UtcDateTime),
+    Index("ix_api_keys_tenant_id", "tenant", "id"),
+)
+
+audit = Table(
+    "audit",
+    metadata,
+    Column("seq", Sequence, primary_key=True, autoincrement=True),
+    Column("at", UtcDateTime, nullable=False),
+    Column("tenant", String(64)),  # none where nobody's key was refused
+    Column("key_id", String(64)),
+    Column("address", String(64), nullable=False),
+    Column("request_id", String(128), nullable=False),
+    Column("action", String(200), nullable=False),
+    Column("object", Text, nullable=False),
+    Column("status", Integer, nullable=False),
+    Column("code", String(64)),
+    Column("count", Integer, nullable=False),
+    Index("ix_audit_tenant_seq", "tenant", "seq"),
+    sqlite_autoincrement=True,
 )
 
 shards = Table(

@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 from collections.abc import Iterable, Sequence
 from functools import partial
 
+from pydantic import TypeAdapter
 from sqlalchemy import select
 
+from services.domain.access import ALL_SCOPES, DEFAULT_TENANT, ApiKey, AuditEntry, AuditEvent, Scope
+from services.domain.keys import hash_key, new_key
 from services.domain.models import (
     CommitRecord,
     Event,
@@ -19,9 +24,12 @@ from services.domain.models import (
     ShardPlan,
 )
 from services.domain.states import JobState, VideoStatus
-from services.store import jobs, leases, migrations, planning, reading
+from services.store import audit, idempotency, jobs, keys, leases, migrations, planning, reading
 from services.store.base import Deferral, VideoRow
-from services.store.database import Database
+from services.store.database import Database, Tx
+
+# The answer to a repeated request is a job as it was; a field that a later release adds has its default then.
+_JOBS = TypeAdapter(Job)
 
 
 class SqlStore:
@@ -46,10 +54,26 @@ class SqlStore:
 
     # Jobs -----------------------------------------------------------------------------------------------------------
     def create_job(
-        self, spec: JobSpec, *, tenant: str = "default", idempotency_key: str | None = None
+        self,
+        spec: JobSpec,
+        *,
+        tenant: str = DEFAULT_TENANT,
+        idempotency_key: str | None = None,
+        request_hash: str | None = None,
     ) -> tuple[Job, bool]:
-        job_id, created = self._db.write(lambda tx: jobs.create_job(tx, spec, tenant, idempotency_key))
-        return self.get_job(job_id), created
+        def create(tx: Tx) -> tuple[Job, bool]:
+            if idempotency_key is None:
+                return reading.get_job(tx, jobs.create_job(tx, spec, tenant)), True
+            request = request_hash or hashlib.sha256(json.dumps(spec.to_json(), sort_keys=True).encode()).hexdigest()
+            idempotency.hold(tx, tenant, idempotency_key)
+            known = idempotency.answer_of(tx, tenant, idempotency_key, request)
+            if known is not None:
+                return _JOBS.validate_python(known), False
+            job = reading.get_job(tx, jobs.create_job(tx, spec, tenant))
+            idempotency.keep_answer(tx, tenant, idempotency_key, request, _JOBS.dump_python(job, mode="json"))
+            return job, True
+
+        return self._db.write(create)
 
     def get_job(self, job_id: str, *, tenant: str | None = None) -> Job:
         return self._db.read(lambda tx: reading.get_job(tx, job_id, tenant))
@@ -134,6 +158,41 @@ class SqlStore:
 
     def finish_sweep(self, job_id: str) -> None:
         self._db.write(lambda tx: jobs.finish_sweep(tx, job_id))
+
+    # Access ---------------------------------------------------------------------------------------------------------
+    def create_key(
+        self,
+        name: str,
+        *,
+        tenant: str = DEFAULT_TENANT,
+        scopes: frozenset[Scope] = ALL_SCOPES,
+        expires_in_s: float | None = None,
+    ) -> tuple[ApiKey, str]:
+        key_id, key = new_key()
+        key_hash = hash_key(key)
+        self._db.write(lambda tx: keys.create(tx, key_id, key_hash, tenant, name, scopes, expires_in_s))
+        return self._db.read(lambda tx: keys.get(tx, key_id)), key
+
+    def find_key(self, key_id: str) -> tuple[ApiKey, str, bool] | None:
+        return self._db.read(lambda tx: keys.find(tx, key_id))
+
+    def list_keys(
+        self, *, tenant: str | None = None, limit: int = 100, after: str | None = None
+    ) -> tuple[list[ApiKey], str | None]:
+        return self._db.read(lambda tx: keys.list_all(tx, tenant, limit, after))
+
+    def revoke_key(self, key_id: str, *, tenant: str | None = None) -> ApiKey:
+        self._db.write(lambda tx: keys.revoke(tx, key_id, tenant))
+        return self._db.read(lambda tx: keys.get(tx, key_id, tenant))
+
+    def touch_key(self, key_id: str) -> None:
+        self._db.write(lambda tx: keys.touch(tx, key_id))
+
+    def record_audit(self, entries: Sequence[AuditEntry]) -> None:
+        self._db.write(lambda tx: audit.record(tx, entries))
+
+    def audit(self, tenant: str, *, limit: int = 100, after: str | None = None) -> tuple[list[AuditEvent], str | None]:
+        return self._db.read(lambda tx: audit.read(tx, tenant, limit, after))
 
     # Reading --------------------------------------------------------------------------------------------------------
     def list_videos(

@@ -6,12 +6,14 @@ import os
 import subprocess
 import sys
 import threading
+import time
 from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 
 from store_helpers import planned_job, record, spec
 
+from services.domain.errors import IdempotencyInFlight
 from services.domain.events import EventKind
 from services.domain.models import Lease, ShardPlan, VideoRef
 from services.domain.states import JobState
@@ -156,7 +158,12 @@ def test_one_owner_per_output_and_one_job_per_key(store: SqlStore) -> None:
     results: list[str] = []
 
     def submit() -> None:
-        results.append(store.create_job(spec(), idempotency_key="k")[0].id)
+        while True:
+            try:
+                results.append(store.create_job(spec(), idempotency_key="k")[0].id)
+                return
+            except IdempotencyInFlight:
+                time.sleep(0.01)
 
     at_once(*[submit] * 6)
     assert len(set(results)) == 1

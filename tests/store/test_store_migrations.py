@@ -55,6 +55,22 @@ def test_upgrading_keeps_what_is_there(store_url: str) -> None:
     store.close()
 
 
+def test_jobs_of_the_first_release_are_still_there(store_url: str) -> None:
+    database = Database(store_url)
+    migrations.upgrade(database, "0001")
+    row = {"id": "job_1", "tenant": "default", "output": "/out", "state": "queued", "spec": '{"inputs": ["/in"]}'}
+    with database.engine.begin() as conn:
+        names = ", ".join([*row, "created_at", "updated_at"])
+        values = ", ".join([*(f":{name}" for name in row), "CURRENT_TIMESTAMP", "CURRENT_TIMESTAMP"])
+        conn.execute(text(f"INSERT INTO jobs ({names}) VALUES ({values})"), row)
+        used = "INSERT INTO idempotency_keys VALUES ('default', 'k', 'hash', 'job_1', CURRENT_TIMESTAMP)"
+        conn.execute(text(used))
+    migrations.upgrade(database)
+    with database.engine.connect() as conn:
+        assert conn.execute(text("SELECT id FROM jobs")).scalars().all() == ["job_1"]
+    database.close()
+
+
 def test_many_processes_start_at_once(store_url: str) -> None:
     errors: list[Exception] = []
 
