@@ -66,7 +66,16 @@ class Settings(BaseSettings):
     """A lease that is not renewed for so long is given to another agent; renewed every third of it."""
 
     max_worker_deaths: int = Field(default=3, ge=1)
-    """A video that killed its worker process so often is quarantined."""
+    """A video that killed its worker process so often is quarantined; so is one that did it in two places."""
+
+    recycle_videos: int = Field(default=1000, ge=0)
+    """A worker process is replaced after so many videos, which bounds what a leak can cost; 0: never."""
+
+    recycle_age_s: float = Field(default=7200.0, ge=0)
+    """A worker process is replaced after so many seconds, between two videos; 0: never."""
+
+    recycle_growth_bytes: int = Field(default=4 << 30, ge=0)
+    """A worker process is replaced that has grown by so much since its first video; 0: never."""
 
     video_timeout_base_s: float = Field(default=300.0, gt=0)
     """Wall time that a video may take: this, plus `video_timeout_per_frame_s` for each of its frames."""

@@ -11,7 +11,7 @@ import threading
 from typing import TYPE_CHECKING
 
 from services.agent.traffic import TrafficMetrics
-from services.domain.errors import CommitConflict
+from services.domain.errors import CommitConflict, StorageError
 from services.domain.models import CommitRecord, Job, Lease
 from services.observability.metrics import Metrics
 from services.storage import ObjectStore, open_store
@@ -49,11 +49,14 @@ class Committer:
 
     def write(self, lease: Lease, payload: PreparedPayload) -> CommitOutcome:
         """The commit point. Idempotent; see `services.commit.protocol.write_record` for what it raises."""
-        from services.commit.protocol import write_record
+        from services.commit.protocol import write_decided, write_record
 
         output = self.output(lease.spec.output)
         try:
-            outcome = write_record(output, payload, lambda: self._store.holds(lease.shard_id, lease.fence))
+            if lease.create_once:
+                outcome = write_record(output, payload, lambda: self._store.holds(lease.shard_id, lease.fence))
+            else:
+                outcome = write_decided(output, payload, self._store.decide_commit)
         except CommitConflict:
             self._metrics.commit_conflicts.labels(result="conflict").inc()
             raise
@@ -61,6 +64,21 @@ class Committer:
             self._metrics.commit_conflicts.labels(result=outcome.kind).inc()
             logger.warning("commit of %s: %s", lease.shard_id, outcome.kind)
         return outcome
+
+    def tar_name(self, lease: Lease) -> str | None:
+        """A tar name for one packing of a shard; None where the output decides who takes it.
+
+        Raises:
+            StorageError: All names that this lease may try are taken, or it is not current any more.
+        """
+        from services.commit.protocol import tar_names
+
+        if lease.create_once:
+            return None
+        name = self._store.take_tar_name(lease.shard_id, lease.fence, tar_names(lease))
+        if name is None:
+            raise StorageError(f"no tar name for shard {lease.shard_id}: all are taken, or its lease is lost")
+        return name
 
     def record(self, record: CommitRecord) -> bool:
         """Tell the database what the output says, and count it if the database did not know."""
@@ -79,7 +97,10 @@ class Committer:
         """
         from services.commit.reconcile import committed_record
 
-        found = committed_record(self.output(lease.spec.output), lease.job_id, lease.shard_id)
+        output = self.output(lease.spec.output)
+        if not lease.create_once:
+            self._put_decided(output, lease.job_id, self._store.decided_commit(lease.shard_id))
+        found = committed_record(output, lease.job_id, lease.shard_id)
         if found is None:
             return False
         self.record(found)
@@ -92,10 +113,25 @@ class Committer:
         open_shards = {shard.id for shard in self._store.uncommitted_shards(job.id)}
         if not open_shards:
             return 0
-        missed = 0
-        for record in committed_records(self.output(job.spec.output), job.id):
+        output, missed = self.output(job.spec.output), 0
+        for decided in self._store.decided_commits(job.id):
+            self._put_decided(output, job.id, decided)
+        for record in committed_records(output, job.id):
             if record.shard_id in open_shards and self.record(record):
                 missed += 1
         if missed:
             logger.info("found %d committed shards of %s that the database had missed", missed, job.id)
         return missed
+
+    @staticmethod
+    def _put_decided(output: ObjectStore, job_id: str, decided: bytes | None) -> None:
+        """Put a record that the database decided where readers look for it. Its holder may have died before."""
+        from services.commit.layout import commit_key
+        from services.commit.protocol import read_record
+
+        if decided is None:
+            return
+        record = read_record(decided, f"of {job_id} in the database")
+        key = commit_key(record.job_id, record.shard_id)
+        if output.head(key) is None:
+            output.put_bytes(key, decided)

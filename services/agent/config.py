@@ -41,6 +41,7 @@ class AgentConfig:
         start_timeout_s: A worker process that is not ready by then counts as failed.
         cancel_grace_s: How long a worker may take to stop by itself before it is killed.
         max_worker_deaths: A video that killed its worker so often is quarantined.
+        max_death_places: So is one that killed workers in so many places, GPUs or slots.
         max_video_tries: Attempts within one lease at a video whose error says that another attempt can succeed.
         max_slot_deaths: Deaths in a row on distinct videos after which a slot is fenced.
         storage_tries: Attempts at one storage operation before the lease is given back.
@@ -48,6 +49,9 @@ class AgentConfig:
             becomes an error row, and a shard that still cannot be packed fails its job.
         fence_cooloff_s: How long a fenced slot rests before it gets another chance.
         backoff_base_s, backoff_max_s: Full-jitter exponential backoff after a failure of storage or the store.
+        recycle_videos: A worker is replaced after so many videos, which bounds what a leak can cost; 0: never.
+        recycle_age_s: A worker is replaced after so long, between two videos; 0: never.
+        recycle_growth_bytes: A worker is replaced that has grown by so much since its first video; 0: never.
         scratch_max_age_s: Leftovers of shards that nobody came back for are removed after this.
         engine: `module:callable` that opens an engine from (preset, camera, device).
         input_roots: Where local inputs must lie; empty: anywhere.
@@ -70,6 +74,7 @@ class AgentConfig:
     start_timeout_s: float = 120.0
     cancel_grace_s: float = 5.0
     max_worker_deaths: int = 3
+    max_death_places: int = 2
     max_video_tries: int = 2
     max_slot_deaths: int = 3
     storage_tries: int = 4
@@ -77,6 +82,9 @@ class AgentConfig:
     fence_cooloff_s: float = 300.0
     backoff_base_s: float = 1.0
     backoff_max_s: float = 60.0
+    recycle_videos: int = 1000
+    recycle_age_s: float = 7200.0
+    recycle_growth_bytes: int = 4 << 30
     scratch_max_age_s: float = 86400.0
     engine: str = DEFAULT_ENGINE
     input_roots: tuple[Path, ...] = ()
@@ -111,6 +119,9 @@ def config_from_settings(settings: Settings) -> AgentConfig:
         video_budget_base_s=settings.video_timeout_base_s,
         video_budget_per_frame_s=settings.video_timeout_per_frame_s,
         max_worker_deaths=settings.max_worker_deaths,
+        recycle_videos=settings.recycle_videos,
+        recycle_age_s=settings.recycle_age_s,
+        recycle_growth_bytes=settings.recycle_growth_bytes,
         input_roots=settings.input_roots,
         output_roots=settings.output_roots,
         s3_endpoint_url=settings.s3_endpoint_url,

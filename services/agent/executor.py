@@ -28,6 +28,10 @@ class Died:
 class SlotHandle(Protocol):
     """One worker process. Called from one thread only, except `progress`."""
 
+    @property
+    def place(self) -> str:
+        """Where its processes run: host and GPU, or host and slot. Empty before the first one."""
+
     def start(self, timeout_s: float) -> Died | None:
         """Start a fresh process and wait until it answers; None when it does."""
 

@@ -165,6 +165,8 @@ class JobKeeper:
             from services.commit.gc import collect_garbage  # Slow to import; see `services.agent.commits`.
 
             abandoned = job.state in (JobState.FAILED, JobState.CANCELLED)
+            if abandoned:  # What was decided just before the end counts, and its payload stays.
+                self._committer.reconcile(job)
             collect_garbage(self._committer.output(job.spec.output), job.id, abandoned=abandoned)
         except Exception as error:
             deferral = self._store.defer_job(

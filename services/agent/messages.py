@@ -22,10 +22,15 @@ class AnnotateVideo:
 
 @dataclass(frozen=True, slots=True)
 class PackShard:
-    """Build, verify and upload the tars of the videos that succeeded."""
+    """Build, verify and upload the tars of the videos that succeeded.
+
+    Attributes:
+        tar_name: Taken for this task in the database; None where the output decides who takes a name.
+    """
 
     lease: Lease
     results: tuple[VideoResult, ...]
+    tar_name: str | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,8 +111,15 @@ class Traffic:
 
 @dataclass(frozen=True, slots=True)
 class Reply:
+    """What a worker says at the end of a task.
+
+    Attributes:
+        rss_bytes: Its memory then; 0 where it is not known.
+    """
+
     answer: Answer
     traffic: Traffic = field(default_factory=Traffic)
+    rss_bytes: int = 0
 
 
 @dataclass(frozen=True, slots=True)

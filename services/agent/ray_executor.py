@@ -18,6 +18,7 @@ import os
 import secrets
 import shutil
 import signal
+import socket
 import tempfile
 import threading
 import time
@@ -60,11 +61,12 @@ class SlotActor:
         configure_logging(log_level, "text")
         self._slot = Slot(config)
 
-    def identity(self) -> tuple[str, int]:
-        """(Ray node id, process id)."""
+    def identity(self) -> tuple[str, int, str, tuple[str, ...]]:
+        """(Ray node id, process id, host, the GPUs that this process was given)."""
         import ray
 
-        return ray.get_runtime_context().get_node_id(), os.getpid()
+        gpus = tuple(str(gpu) for gpu in ray.get_gpu_ids())
+        return ray.get_runtime_context().get_node_id(), os.getpid(), socket.gethostname(), gpus
 
     def run(self, task: Task) -> Reply:
         return self._slot.run(task)
@@ -79,13 +81,15 @@ class SlotActor:
 class RaySlot:
     """A `SlotHandle` on a Ray actor."""
 
-    def __init__(self, actor_class: Callable[[], Any], config: AgentConfig, *, private: bool) -> None:
+    def __init__(self, number: int, actor_class: Callable[[], Any], config: AgentConfig, *, private: bool) -> None:
+        self._number = number
         self._actor_class = actor_class
         self._config = config
         self._private = private
         self._actor: Any = None
         self._pid: int | None = None
         self._node_id: str | None = None
+        self._place = ""
         self._task: Any = None
         self._lock = threading.Lock()
         self._progress = SlotProgress()
@@ -96,6 +100,10 @@ class RaySlot:
     def pid(self) -> int | None:
         """The worker's process id on its node; None while there is no process."""
         return self._pid
+
+    @property
+    def place(self) -> str:
+        return self._place
 
     def start(self, timeout_s: float) -> Died | None:
         import ray
@@ -118,9 +126,10 @@ class RaySlot:
         level = logging.getLevelName(logging.getLogger().getEffectiveLevel())
         try:
             self._actor = self._actor_class().options(**options).remote(slot_config, level)
-            self._node_id, self._pid = ray.get(self._actor.identity.remote(), timeout=timeout_s)
+            self._node_id, self._pid, host, gpus = ray.get(self._actor.identity.remote(), timeout=timeout_s)
         except RayError as error:
             return _died(error)
+        self._place = f"{host}/gpu-{','.join(gpus)}" if gpus else f"{host}/slot-{self._number}"
         with self._lock:
             self._progress, self._progress_call = SlotProgress(), None
         return None
@@ -217,7 +226,8 @@ class RayExecutor:
         """
         self._connect()
         self._slots = [
-            RaySlot(lambda: self._actor_class, self._config, private=self._private) for _ in range(self._num_slots or 1)
+            RaySlot(number, lambda: self._actor_class, self._config, private=self._private)
+            for number in range(self._num_slots or 1)
         ]
 
     def restart(self) -> None:

@@ -7,6 +7,7 @@ stable code, so that only a dead process looks like a dead process.
 from __future__ import annotations
 
 import logging
+import resource
 import threading
 import time
 import traceback
@@ -88,7 +89,7 @@ class Slot:
             answer = Cancelled()
         finally:
             self._progress = SlotProgress()
-        return Reply(answer, self._traffic.take())
+        return Reply(answer, self._traffic.take(), _rss_bytes())
 
     def progress(self) -> SlotProgress:
         return self._progress
@@ -168,7 +169,9 @@ class Slot:
         self._progress = SlotProgress(None, "pack")
         scratch = ShardScratch(self._config.scratch_dir, task.lease)
         output = open_store(task.lease.spec.output, endpoint_url=self._config.s3_endpoint_url, observer=self._traffic)
-        return Packed(prepare_payload(task.lease, task.results, scratch.artifacts, scratch.tars, output))
+        return Packed(
+            prepare_payload(task.lease, task.results, scratch.artifacts, scratch.tars, output, tar_name=task.tar_name)
+        )
 
     def _engine(self, preset: str, camera: str) -> Engine:
         engine = self._engines.get((preset, camera))
@@ -200,6 +203,15 @@ class Slot:
         expected = frames_total or self._progress.frames_expected
         done = int(share * expected) if expected else 0
         self._progress = replace(self._progress, stage=stage, frames_done=done, frames_expected=expected)
+
+
+def _rss_bytes() -> int:
+    """Memory of this process that is really there; 0 where the platform does not say."""
+    try:
+        pages = int(Path("/proc/self/statm").read_text().split()[1])
+    except (OSError, ValueError, IndexError):
+        return 0
+    return pages * resource.getpagesize()
 
 
 def failed_row(video: VideoRef, attempt: int, code: str, message: str) -> VideoResult:

@@ -40,7 +40,7 @@ from services.agent.messages import (
 from services.agent.slot import failed_row
 from services.agent.traffic import TrafficMetrics
 from services.domain.errors import InputUnavailable, ServiceError
-from services.domain.models import Lease, VideoRef, VideoResult
+from services.domain.models import Death, Lease, VideoRef, VideoResult
 from services.domain.states import VideoStatus
 from services.observability.logging import context
 from services.observability.metrics import Metrics
@@ -117,6 +117,10 @@ class Supervisor:
         self._sleep = sleep
         self._alive = False
         self._suspicious: list[str] = []
+        self._born_s = 0.0
+        self._videos = 0
+        self._grown_from_bytes = 0
+        self._rss_bytes = 0
 
     def work(self, live: LiveLease) -> ShardOutcome:
         """Bring a lease to its end. Gives the lease back or lets it go as the outcome says; never raises."""
@@ -144,6 +148,7 @@ class Supervisor:
             died = Died(f"{type(error).__name__}: {error}")
         if died is None:
             self._alive = True
+            self._born_s, self._videos, self._grown_from_bytes = self._clock(), 0, 0
             return True
         self._metrics.actor_restarts.labels(reason="start_failed").inc()
         logger.error("a worker process did not start: %s", died.detail)
@@ -172,7 +177,8 @@ class Supervisor:
             self._annotate_all(live, results, deaths)
             live.follow(tuple(results.values()), self._handle.progress)
             ordered = tuple(results[video.key] for video in lease.videos)
-            answer = self._run(live, PackShard(lease, ordered), lambda: self._config.pack_budget_s)
+            tar_name = self._persist(lambda: self._committer.tar_name(lease))
+            answer = self._run(live, PackShard(lease, ordered, tar_name), lambda: self._config.pack_budget_s)
             match answer:
                 case Packed(payload):
                     self._metrics.stage_duration.labels(stage="pack").observe(payload.build_s)
@@ -190,17 +196,23 @@ class Supervisor:
                 case _:
                     raise TypeError(f"unexpected answer {type(answer).__name__} to a pack task")
 
-    def _annotate_all(self, live: LiveLease, results: dict[str, VideoResult], deaths: dict[str, int]) -> None:
+    def _annotate_all(
+        self, live: LiveLease, results: dict[str, VideoResult], deaths: dict[str, tuple[Death, ...]]
+    ) -> None:
         """Fill `results` until every video of the lease has one."""
         lease = live.lease
         tries: dict[str, int] = {}
         storage = self._backoff()
         while missing := [video for video in lease.videos if video.key not in results]:
             # Those that have killed a worker go last: the others are safe by then, and the slot has proved itself.
-            video = min(missing, key=lambda v: deaths.get(v.key, 0))
-            if deaths.get(video.key, 0) >= self._config.max_worker_deaths:
+            video = min(missing, key=lambda v: len(deaths.get(v.key, ())))
+            if self._is_poison(deaths.get(video.key, ())):
                 results[video.key] = self._quarantined(video, lease, deaths[video.key])
                 continue
+            if self._worn_out():
+                self._metrics.actor_restarts.labels(reason="recycled").inc()
+                self.stop()
+                self._replace(results, self._opened(live, results))
             live.follow(tuple(results.values()), self._handle.progress)
             with context(video=video.key):
                 answer = self._run(live, AnnotateVideo(lease, video), partial(self._budget_s, video))
@@ -305,6 +317,10 @@ class Supervisor:
                 return outcome
             if outcome is not None:
                 self._traffic.add(outcome.traffic)
+                if isinstance(task, AnnotateVideo):
+                    self._videos += 1
+                    self._rss_bytes = outcome.rss_bytes
+                    self._grown_from_bytes = self._grown_from_bytes or outcome.rss_bytes
                 if isinstance(outcome.answer, Cancelled):
                     raise _Ended(ShardOutcome("stopped", live.stop_reason or "interrupted"))
                 return outcome.answer
@@ -337,24 +353,50 @@ class Supervisor:
 
     # Blame ----------------------------------------------------------------------------------------------------------
 
-    def _died_on(self, live: LiveLease, video: VideoRef, died: Died, deaths: dict[str, int]) -> None:
+    def _died_on(self, live: LiveLease, video: VideoRef, died: Died, deaths: dict[str, tuple[Death, ...]]) -> None:
         if died.preempted:
             logger.warning("the machine of a worker was taken away; its video is not blamed: %s", died.detail)
             return
-        first = deaths.get(video.key, 0) == 0
-        deaths[video.key] = self._blame(live, video, died.detail, deaths.get(video.key, 0))
-        logger.error("the worker died (%d of %d): %s", deaths[video.key], self._config.max_worker_deaths, died.detail)
+        before = deaths.get(video.key, ())
+        first = not before
+        lease = live.lease
+        death = Death(died.detail[:200], self._handle.place, lease.holder, lease.attempt)
+        deaths[video.key] = self._blame(lease, video, death, before)
+        logger.error(
+            "the worker died (%d of %d): %s", len(deaths[video.key]), self._config.max_worker_deaths, died.detail
+        )
         if first:  # A video that is known to kill says nothing new about the slot.
             self._suspect(video.key)
 
-    def _blame(self, live: LiveLease, video: VideoRef, detail: str, before: int) -> int:
+    def _blame(self, lease: Lease, video: VideoRef, death: Death, before: tuple[Death, ...]) -> tuple[Death, ...]:
         """Count the death where it survives this process; if the store does not answer, at least here."""
+        at_least = (*before, death)
         try:
-            count = self._store.blame(live.lease.shard_id, live.lease.fence, video.key, detail[:200])
+            counted = self._store.blame(lease.shard_id, lease.fence, video.key, death)
         except Exception as error:
             logger.warning("could not record the death: %s", error)
-            return before + 1
-        return max(count, before + 1)
+            return at_least
+        return counted if len(counted) >= len(at_least) else at_least
+
+    def _is_poison(self, deaths: tuple[Death, ...]) -> bool:
+        """Dead in two places, it is the video and not the place; dead often enough, nobody asks any more."""
+        places = {death.place for death in deaths if death.place}
+        return len(deaths) >= self._config.max_worker_deaths or len(places) >= self._config.max_death_places
+
+    def _worn_out(self) -> bool:
+        """Whether the worker process has done enough: leaks of drivers and decoders end with it."""
+        config = self._config
+        if not self._alive or self._videos == 0:
+            return False
+        reasons = {
+            "videos": 0 < config.recycle_videos <= self._videos,
+            "age": 0 < config.recycle_age_s <= self._clock() - self._born_s,
+            "memory": 0 < config.recycle_growth_bytes <= self._rss_bytes - self._grown_from_bytes,
+        }
+        for reason in (reason for reason, worn_out in reasons.items() if worn_out):
+            logger.info("the worker is replaced after %d videos: %s", self._videos, reason)
+            return True
+        return False
 
     def _suspect(self, key: str) -> None:
         if key not in self._suspicious:
@@ -367,11 +409,14 @@ class Supervisor:
             )
             raise _Ended(ShardOutcome("given_back", "slot_fenced", "the worker keeps dying", fenced=True))
 
-    def _quarantined(self, video: VideoRef, lease: Lease, deaths: int) -> VideoResult:
-        message = f"{video.uri}: the worker process died {deaths} times on this video; it is not tried again"
+    def _quarantined(self, video: VideoRef, lease: Lease, deaths: tuple[Death, ...]) -> VideoResult:
+        message = (
+            f"{video.uri}: the worker process died {len(deaths)} times on this video, the last time: "
+            f"{deaths[-1].reason}; it is not tried again"
+        )
         logger.error("quarantined: %s", message)
         row = failed_row(video, lease.attempt, WORKER_DIED, message)
-        return replace(row, status=VideoStatus.QUARANTINED)
+        return replace(row, status=VideoStatus.QUARANTINED, deaths=deaths)
 
     # Endings --------------------------------------------------------------------------------------------------------
 

@@ -4,7 +4,14 @@ from __future__ import annotations
 
 from services.commit.gc import GcReport, collect_garbage
 from services.commit.layout import ATTRIBUTES, attributes_of, commit_key, payload_key
-from services.commit.protocol import CommitOutcome, PreparedPayload, prepare_payload, write_record
+from services.commit.protocol import (
+    CommitOutcome,
+    PreparedPayload,
+    prepare_payload,
+    tar_names,
+    write_decided,
+    write_record,
+)
 from services.commit.reconcile import committed_record, committed_records
 
 __all__ = [
@@ -19,5 +26,7 @@ __all__ = [
     "committed_records",
     "payload_key",
     "prepare_payload",
+    "tar_names",
+    "write_decided",
     "write_record",
 ]

@@ -6,6 +6,9 @@
 2. `write_record` asks whether the lease still holds (cheap, stops most zombies) and then creates the shard's record.
    This one create-once PUT is the commit point.
 
+Where the output does not know create-once writes, the database is asked instead: it hands out the tar name, and
+`write_decided` makes its row of the shard the commit point; the record then follows into the output, by whoever lives.
+
 Two rules keep it safe. Bytes under a tar name are written by one call only, so a record can never point at bytes of
 another attempt. And a payload is deleted only after another attempt's record has been seen: only then can the own
 record never land any more, not even from a request that was thought lost.
@@ -90,6 +93,7 @@ def prepare_payload(
     store: ObjectStore,
     *,
     prefix: str = DEFAULT_PREFIX,
+    tar_name: str | None = None,
 ) -> PreparedPayload:
     """Build, verify and upload the tars of a shard, and make its record without writing it.
 
@@ -98,6 +102,7 @@ def prepare_payload(
         artifacts_root: ViPE artifact layout (`pose/KEY.npz` ...) of the videos that succeeded.
         scratch: Folder for the tars; empty again afterwards.
         prefix: Start of the tar name, `[a-z0-9]+`.
+        tar_name: A name that the database gave to this call alone; None takes one with a create-once claim.
 
     Raises:
         IntegrityError: Results do not match the lease, an artifact is missing, or the tars do not read back.
@@ -106,7 +111,6 @@ def prepare_payload(
     """
     videos = _settled(lease, results)
     keys = sorted(v.key for v in videos if v.status is VideoStatus.SUCCEEDED)
-    tar_name: str | None = None
     objects: list[PayloadObject] = []
     build_s = upload_s = 0.0
     if keys:
@@ -122,7 +126,10 @@ def prepare_payload(
             build_s = time.monotonic() - started
 
             started = time.monotonic()
-            tar_name = _claim_name(store, lease, prefix)
+            if tar_name is None:
+                tar_name = _claim_name(store, lease, prefix)
+            else:  # Its claim only tells the garbage collection whose it is.
+                store.put_bytes(claim_key(tar_name), _claim(lease))
             try:
                 for attribute, tar, members in built:
                     key = payload_key(tar_name, attribute)
@@ -137,6 +144,8 @@ def prepare_payload(
             upload_s = time.monotonic() - started
         finally:
             shutil.rmtree(folder, ignore_errors=True)
+    else:
+        tar_name = None
     record = CommitRecord(
         job_id=lease.job_id,
         shard_id=lease.shard_id,
@@ -182,6 +191,31 @@ def write_record(store: ObjectStore, prepared: PreparedPayload, holds: Callable[
     if existing is None:
         raise StorageError(f"{store.uri}/{key} was there and is gone; nothing may delete commit records")
     return _settle(store, prepared, key, existing)
+
+
+def write_decided(
+    store: ObjectStore, prepared: PreparedPayload, decide: Callable[[CommitRecord], bytes | None]
+) -> CommitOutcome:
+    """`write_record` where the database is the commit point. Idempotent: after an error, call it again.
+
+    Args:
+        decide: Atomically keeps the record if the lease is current and no record was kept; gives the one that counts,
+            None if there is none.
+
+    Raises:
+        CommitConflict: A record of another plan or configuration has this name.
+        IntegrityError: The record that is there cannot be read.
+        StorageError: The store did not answer; what was decided stands, and somebody must put it there.
+    """
+    record = prepared.record
+    key = commit_key(record.job_id, record.shard_id)
+    if (existing := _read(store, key)) is not None:  # Its database may have been restored from before it.
+        return _settle(store, prepared, key, existing)
+    counts = decide(record)
+    if counts is None:
+        return CommitOutcome("lost_lease", None)
+    store.put_bytes(key, counts)  # Only these bytes are ever put there, so it may be repeated, also late.
+    return _settle(store, prepared, key, counts)
 
 
 def read_record(data: bytes, where: str) -> CommitRecord:
@@ -237,6 +271,21 @@ def _claim_name(store: ObjectStore, lease: Lease, prefix: str) -> str:
     32 bits over 100,000 shards do collide, and an attempt may be prepared twice, so the name is taken with a
     create-once object whose content tells us apart. It stays, so that the garbage collection knows whose payload it is.
     """
+    data = _claim(lease)
+    for name in tar_names(lease, prefix):
+        if store.create(claim_key(name), data) or _read(store, claim_key(name)) == data:
+            return name
+    raise StorageError(f"no free tar name for shard {lease.shard_id} in {store.uri}")
+
+
+def tar_names(lease: Lease, prefix: str = DEFAULT_PREFIX) -> list[str]:
+    """Names that an attempt may try to take, in this order."""
+    sources = (f"{lease.shard_id}/{lease.attempt}/{lease.fence}/{number}" for number in range(_NAME_TRIES))
+    return [f"{prefix}-{hashlib.sha256(source.encode()).hexdigest()[:8]}" for source in sources]
+
+
+def _claim(lease: Lease) -> bytes:
+    """Whose a tar name is; no two calls give the same."""
     claim = {
         "job_id": lease.job_id,
         "shard_id": lease.shard_id,
@@ -244,13 +293,7 @@ def _claim_name(store: ObjectStore, lease: Lease, prefix: str) -> str:
         "fence": lease.fence,
         "nonce": uuid.uuid4().hex,
     }
-    data = json.dumps(claim, sort_keys=True).encode()
-    for number in range(_NAME_TRIES):
-        source = f"{lease.shard_id}/{lease.attempt}/{lease.fence}/{number}"
-        name = f"{prefix}-{hashlib.sha256(source.encode()).hexdigest()[:8]}"
-        if store.create(claim_key(name), data) or _read(store, claim_key(name)) == data:
-            return name
-    raise StorageError(f"no free tar name for shard {lease.shard_id} in {store.uri}")
+    return json.dumps(claim, sort_keys=True).encode()
 
 
 def _read(store: ObjectStore, key: str) -> bytes | None:

@@ -35,6 +35,7 @@ FAILURES_SCHEMA = pa.schema(
         ("error_message", pa.string()),
         ("attempt", pa.int32()),
         ("shard_id", pa.string()),
+        ("deaths_json", pa.string()),
     ]
 )
 
@@ -146,6 +147,7 @@ def failure_row(record: CommitRecord, video: VideoResult) -> dict[str, Any]:
         "error_message": video.error_message,
         "attempt": video.attempt,
         "shard_id": record.shard_id,
+        "deaths_json": None if video.deaths is None else json.dumps([death.to_json() for death in video.deaths]),
     }
 
 

@@ -56,13 +56,6 @@ class OutputInUse(ServiceError):
     status = 409
 
 
-class OutputUnsupported(ServiceError):
-    """The output cannot decide which of two writers came first, so nothing could be committed exactly once."""
-
-    code = "output_unsupported"
-    status = 422
-
-
 class IdempotencyConflict(ServiceError):
     """The same `Idempotency-Key` came with another body."""
 
@@ -140,6 +133,12 @@ class StorageRefused(StorageError):
     code = "storage_refused"
     status = 422
     retryable = False
+
+
+class ConditionUnsupported(StorageRefused):
+    """The object store does not know writes on the condition that nothing is there."""
+
+    code = "condition_unsupported"
 
 
 class StoreUnavailable(ServiceError):

@@ -16,6 +16,7 @@ class EventKind(StrEnum):
     JOB_SUCCEEDED_WITH_ERRORS = "job.succeeded_with_errors"
     JOB_FAILED = "job.failed"
     JOB_CANCELLED = "job.cancelled"
+    OUTPUT_PROBED = "output.probed"  # who decides a commit: the output, or the database
     SHARDS_PLANNED = "shards.planned"  # a batch of shards was added
     PLANNING_FINISHED = "planning.finished"
     SHARD_LEASED = "shard.leased"

@@ -144,13 +144,36 @@ class Job:
 
 
 @dataclass(frozen=True, slots=True)
+class Death:
+    """The end of a worker process that a video is blamed for.
+
+    Attributes:
+        reason: What ended it, in one line.
+        place: Host and GPU, or host and slot; deaths in two places say more about the video than about either.
+        holder: The agent.
+        attempt: Of the shard.
+        at: When the store heard of it, RFC 3339.
+    """
+
+    reason: str
+    place: str = ""
+    holder: str = ""
+    attempt: int = 0
+    at: str = ""
+
+    def to_json(self) -> dict[str, Any]:
+        return asdict(self)
+
+
+@dataclass(frozen=True, slots=True)
 class Lease:
     """The right to work on one shard, until it expires.
 
     Attributes:
         fence: Grows with every lease of the shard; a smaller fence has lost.
         attempt: 1 for the first lease.
-        spent: Video key -> worker deaths already blamed on it.
+        spent: Video key -> the worker deaths already blamed on it.
+        create_once: Whether the output decides between two writers of a record; otherwise the database does.
     """
 
     job_id: str
@@ -163,7 +186,8 @@ class Lease:
     fence: int
     holder: str
     expires_at: datetime
-    spent: dict[str, int] = field(default_factory=dict)
+    spent: dict[str, tuple[Death, ...]] = field(default_factory=dict)
+    create_once: bool = True
 
 
 @dataclass(frozen=True, slots=True)
@@ -197,6 +221,7 @@ class VideoResult:
         quality: `Quality.summary()` of the engine.
         timings_s: Seconds per stage.
         source: What the probe found (codec, pixel format, rotation, size).
+        deaths: The worker processes that died on it, where it is quarantined for them.
     """
 
     key: str
@@ -222,18 +247,20 @@ class VideoResult:
     timings_s: dict[str, float] | None = None
     source: dict[str, Any] | None = None
     provenance: dict[str, Any] | None = None
+    deaths: tuple[Death, ...] | None = None
 
     def to_json(self) -> dict[str, Any]:
         return asdict(self)
 
     @classmethod
     def from_json(cls, data: dict[str, Any]) -> VideoResult:
-        params = data.get("camera_params")
+        params, deaths = data.get("camera_params"), data.get("deaths")
         return cls(
             **{
                 **data,
                 "status": VideoStatus(data["status"]),
                 "camera_params": None if params is None else tuple(params),
+                "deaths": None if deaths is None else tuple(Death(**death) for death in deaths),
             }
         )
 

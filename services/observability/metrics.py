@@ -119,7 +119,7 @@ class Metrics:
         # Actors.
         self.actor_restarts = Counter(
             "vipe_actor_restarts_total",
-            "Worker processes that had to be replaced, by reason: died, video_timeout, start_failed.",
+            "Worker processes that had to be replaced, by reason: died, video_timeout, start_failed, recycled.",
             ["reason"],
             registry=registry,
         )
@@ -162,7 +162,7 @@ class Metrics:
         self.videos.labels(outcome=VideoStatus.QUARANTINED.value, error_class=WORKER_DIED)
         for code in FAILURE_CODES:
             self.videos.labels(outcome=VideoStatus.FAILED.value, error_class=code)
-        for reason in ("died", "video_timeout", "start_failed"):
+        for reason in ("died", "video_timeout", "start_failed", "recycled"):
             self.actor_restarts.labels(reason=reason)
         for result in ("adopted", "lost_lease", "conflict"):
             self.commit_conflicts.labels(result=result)

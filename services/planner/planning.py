@@ -18,8 +18,8 @@ from pathlib import Path
 from typing import TypeVar
 
 from services.domain.errors import (
+    ObjectMissing,
     OutputInUse,
-    OutputUnsupported,
     ServiceError,
     StorageRefused,
     StoreUnavailable,
@@ -152,7 +152,6 @@ def plan(
         InputUnavailable: An input does not exist or holds no video.
         OutputInUse: The output belongs to another job, or holds files that the job would replace.
         StorageRefused: The output lies outside of the directories that the service may write.
-        OutputUnsupported: The output's storage cannot decide between two writers.
         StorageError: Storage does not answer.
     """
     job = turn.store.get_job(turn.job_id)  # Not before the turn began: from now on nobody else adds shards.
@@ -168,9 +167,10 @@ def plan(
             first_ordinal=job.progress.shards_total,
         )
         for number, batch in enumerate(_batches(shards)):
-            if number == 0:
-                # Not before the first shard: a job whose inputs are wrong leaves no trace in its output.
-                claim_output(open_store(job.spec.output, endpoint_url=s3_endpoint_url), job.id)
+            # Not before the first shard: a job whose inputs are wrong leaves no trace in its output.
+            output = open_store(job.spec.output, endpoint_url=s3_endpoint_url)
+            if number == 0 and not _take_output(turn, output):
+                return
             if not turn.add(batch):
                 return
         turn.finish()
@@ -182,31 +182,62 @@ def check_output_place(output: str, roots: Sequence[Path]) -> None:
         raise StorageRefused(f"output {output} lies outside of the directories that this service may write")
 
 
-def claim_output(output: ObjectStore, job_id: str) -> None:
-    """Write a job's name into its output, once. Idempotent for the same job.
+def _take_output(turn: Turn, output: ObjectStore) -> bool:
+    """Make the output this job's, and settle who decides its commits. False if the turn is lost."""
+    known = turn.store.commit_point(turn.job_id)
+    check_output_is_free(output, turn.job_id)
+    create_once = supports_create_once(output) if known is None else known
+    settled = turn.store.settle_commit_point(turn.job_id, turn.fence, create_once)
+    if settled is None:
+        return False
+    if known is None and not settled:
+        _log.warning(
+            "%s does not enforce create-once writes (If-None-Match): the database decides the commits of %s",
+            output.uri,
+            turn.job_id,
+        )
+    claim_output(output, turn.job_id, create_once=settled)
+    return True
 
-    Raises:
-        OutputInUse: Another job's name is there; or no job's, but files that this job would replace or mix with.
-        OutputUnsupported: The storage lets a second writer replace what the first one created.
-        StorageError: The output cannot be written.
-    """
-    if output.head(CLAIM_KEY) is None:
+
+def check_output_is_free(output: ObjectStore, job_id: str) -> None:
+    """Raises OutputInUse if another job's name is in the output; or no job's, but files that a job would replace."""
+    try:
+        document = output.get_bytes(CLAIM_KEY)
+    except ObjectMissing:
         if (taken := _taken_key(output)) is not None:
-            raise OutputInUse(f"output {output.uri} holds {taken} already, which is not ours; choose another folder")
-        if not supports_create_once(output):
-            raise OutputUnsupported(
-                f"the storage of {output.uri} ignores create-once writes (If-None-Match); use another output"
-            )
-    document = json.dumps({"schema_version": 1, "job_id": job_id}, sort_keys=True) + "\n"
-    if output.create(CLAIM_KEY, document.encode()):
+            raise OutputInUse(
+                f"output {output.uri} holds {taken} already, which is not ours; choose another folder"
+            ) from None
         return
     try:
-        owner = json.loads(output.get_bytes(CLAIM_KEY))["job_id"]
+        owner = json.loads(document)["job_id"]
     except (ValueError, KeyError, TypeError):
         owner = None
     if owner != job_id:
         name = f"job {owner}" if owner else "something else"
         raise OutputInUse(f"output {output.uri} belongs to {name} ({CLAIM_KEY}); choose another output")
+
+
+def claim_output(output: ObjectStore, job_id: str, *, create_once: bool = True) -> None:
+    """Write a job's name into its output, once. Idempotent for the same job.
+
+    Args:
+        create_once: Whether the output decides between two writers. Where not, the database alone keeps two of its
+            jobs apart, and what another database writes to the same place at the same moment is not noticed.
+
+    Raises:
+        OutputInUse: Another job's name is there; or no job's, but files that this job would replace or mix with.
+        StorageError: The output cannot be written.
+    """
+    check_output_is_free(output, job_id)
+    point = "output" if create_once else "database"
+    description = {"schema_version": 1, "job_id": job_id, "commit_point": point}
+    document = (json.dumps(description, sort_keys=True) + "\n").encode()
+    if not create_once:
+        output.put_bytes(CLAIM_KEY, document)
+    elif not output.create(CLAIM_KEY, document):
+        check_output_is_free(output, job_id)
 
 
 def _taken_key(output: ObjectStore) -> str | None:

@@ -33,7 +33,11 @@ class ObjectStore(Protocol):
         """Upload, replacing what is there."""
 
     def create(self, key: str, data: bytes) -> bool:
-        """Create only if absent, atomically. False if an object with this key exists (also after a lost response)."""
+        """Create only if absent, atomically. False if an object with this key exists (also after a lost response).
+
+        Raises `ConditionUnsupported` where the store does not know such a write. One that ignores the condition is
+        found by `supports_create_once` only.
+        """
 
     def get_bytes(self, key: str, start: int = 0, length: int | None = None) -> bytes:
         """Read an object or a range of it."""

@@ -12,12 +12,15 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import BinaryIO, cast
 
-from services.domain.errors import ObjectMissing, StorageError, StorageRefused
+from services.domain.errors import ConditionUnsupported, ObjectMissing, StorageError, StorageRefused
 from services.storage.base import ObjectInfo
 from services.storage.keys import TEMPORARY_PREFIX, check_key
 from services.storage.observer import SilentObserver, StorageObserver
 
 _COPY_CHUNK_BYTES = 4 << 20
+
+# How file systems answer that have no hard links: FAT, and most that stand for something else.
+_NO_LINKS = {errno.EPERM, errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP, errno.EMLINK}
 
 # What no waiting changes.
 _REFUSALS = {errno.EACCES, errno.EPERM, errno.EROFS, errno.ENAMETOOLONG, errno.ENOTDIR, errno.ELOOP, errno.EINVAL}
@@ -63,6 +66,10 @@ class DirectoryStore:
             except FileExistsError:
                 self._observer.request("create", "412")
                 return False
+            except OSError as error:
+                if error.errno in _NO_LINKS:
+                    raise ConditionUnsupported(f"the file system of {self._root} does not know hard links") from error
+                raise
             finally:
                 temporary.unlink(missing_ok=True)
             _flush_folder(target.parent)

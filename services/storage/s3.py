@@ -18,7 +18,7 @@ from botocore.config import Config
 from botocore.exceptions import BotoCoreError, ClientError, NoCredentialsError, PartialCredentialsError
 from botocore.exceptions import HTTPClientError as TransportError
 
-from services.domain.errors import ObjectMissing, StorageError, StorageRefused
+from services.domain.errors import ConditionUnsupported, ObjectMissing, StorageError, StorageRefused
 from services.storage.base import ObjectInfo
 from services.storage.keys import TEMPORARY_PREFIX, check_key
 from services.storage.observer import SilentObserver, StorageObserver
@@ -29,6 +29,8 @@ if TYPE_CHECKING:
 _PART_BYTES = 32 << 20
 _BODY_TRIES = 4  # the client library retries requests, but not a body that breaks off
 _CONFLICT_TRIES = 8
+# How services answer that do not know `If-None-Match` on a write.
+_NO_CONDITIONS = {400, 405, 501}
 _ABSENT = {"404", "NoSuchKey", "NotFound"}
 _DENIED = {"403", "AccessDenied", "AllAccessDisabled", "InvalidAccessKeyId", "SignatureDoesNotMatch"}
 _OPERATIONS = {
@@ -117,6 +119,9 @@ class S3Store:
 
         Where the answer to the PUT is lost, the client library sends it again and is told 412 about its own object:
         False then means "there is an object", and the caller looks whether it is the one it wrote.
+
+        Raises:
+            ConditionUnsupported: The service refuses the condition.
         """
         name = self._name(key)
         for attempt in range(_CONFLICT_TRIES):
@@ -127,6 +132,10 @@ class S3Store:
                 status = _status(error.__cause__)
                 if status == 412:
                     return False
+                if status in _NO_CONDITIONS:
+                    raise ConditionUnsupported(
+                        f"create of {self.uri}/{key} was refused: the service does not know If-None-Match"
+                    ) from error
                 # 409: another conditional write of this key is under way. Only asking again tells who won.
                 if status != 409 or attempt == _CONFLICT_TRIES - 1:
                     raise

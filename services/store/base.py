@@ -16,6 +16,7 @@ from typing import Protocol
 from services.domain.access import ALL_SCOPES, DEFAULT_TENANT, ApiKey, AuditEntry, AuditEvent, Scope
 from services.domain.models import (
     CommitRecord,
+    Death,
     Event,
     Job,
     JobSpec,
@@ -156,8 +157,8 @@ class Store(Protocol):
     def holds(self, shard_id: str, fence: int) -> bool:
         """Whether this lease is still the shard's current one (checked just before the commit point)."""
 
-    def blame(self, shard_id: str, fence: int, video_key: str, reason: str) -> int:
-        """Count a worker death against a video; returns its deaths so far. Survives the lease.
+    def blame(self, shard_id: str, fence: int, video_key: str, death: Death) -> tuple[Death, ...]:
+        """Count a worker death against a video; returns its deaths so far, oldest first. Survives the lease.
 
         A lease that is not current any more has no say: nothing is counted then.
         """
@@ -177,6 +178,31 @@ class Store(Protocol):
         Raises:
             CommitConflict: The record has another plan, or a fence that was never given out.
         """
+
+    # Where the output cannot decide between two writers, the shard's row does; see `services.store.commits`.
+    def settle_commit_point(self, job_id: str, planning_fence: int, create_once: bool) -> bool | None:
+        """Keep what the probe of a job's output found, once and for all agents; returns what counts.
+
+        None, and nothing is kept, if it is not this planner's job any more.
+        """
+
+    def commit_point(self, job_id: str) -> bool | None:
+        """Whether the output decides (True) or this database (False); None before the output was probed."""
+
+    def take_tar_name(self, shard_id: str, fence: int, names: Sequence[str]) -> str | None:
+        """Take the first of `names` that nobody took in this job, for ever. None if all are, or the lease is lost."""
+
+    def decide_commit(self, record: CommitRecord) -> bytes | None:
+        """The commit point: keep this record if the lease is current and none was kept. Returns the one that counts.
+
+        None if there is none and the lease is not current any more.
+        """
+
+    def decided_commit(self, shard_id: str) -> bytes | None:
+        """The record that was decided here and that `record_commit` was not told of yet."""
+
+    def decided_commits(self, job_id: str) -> list[bytes]:
+        """All of them of a job, in the order of its shards."""
 
     def expire_leases(self) -> int:
         """Requeue shards whose lease ran out; settle cancelling jobs that hold no lease any more."""

@@ -6,9 +6,11 @@ hold, so it waits for nobody.
 
 from __future__ import annotations
 
+import hashlib
 import math
 from collections import Counter
 from collections.abc import Sequence
+from dataclasses import replace
 from datetime import timedelta
 from typing import Any
 
@@ -18,6 +20,7 @@ from services.domain.errors import CommitConflict, ShardNotFound
 from services.domain.events import EventKind
 from services.domain.models import (
     CommitRecord,
+    Death,
     JobSpec,
     Lease,
     LeaseProgress,
@@ -65,20 +68,23 @@ def claim(tx: Tx, holder: str, limit: int, ttl_s: float) -> list[Lease]:
         )
     )
     refs: dict[str, list[VideoRef]] = {}
-    spent: dict[str, dict[str, int]] = {}
+    spent: dict[str, dict[str, tuple[Death, ...]]] = {}
     for v in tx.rows(
         select(videos).where(videos.c.shard_id.in_(chosen)).order_by(videos.c.shard_id, videos.c.position)
     ):
         refs.setdefault(v.shard_id, []).append(VideoRef(v.key, v.uri, v.size_bytes, v.etag))
         if v.deaths:
-            spent.setdefault(v.shard_id, {})[v.key] = v.deaths
+            spent.setdefault(v.shard_id, {})[v.key] = _deaths(v)
 
     leases = []
     specs: dict[str, JobSpec] = {}
+    create_once: dict[str, bool] = {}
     leased = select(shards).where(shards.c.id.in_(chosen)).order_by(shards.c.job_id, shards.c.ordinal)
     for s in tx.rows(leased):
         if s.job_id not in specs:
-            specs[s.job_id] = JobSpec.from_json(tx.run(select(jobs.c.spec).where(jobs.c.id == s.job_id)).scalar_one())
+            job = tx.run(select(jobs.c.spec, jobs.c.create_once).where(jobs.c.id == s.job_id)).one()
+            specs[s.job_id] = JobSpec.from_json(job.spec)
+            create_once[s.job_id] = job.create_once is not False
         leases.append(
             Lease(
                 job_id=s.job_id,
@@ -92,6 +98,7 @@ def claim(tx: Tx, holder: str, limit: int, ttl_s: float) -> list[Lease]:
                 holder=holder,
                 expires_at=s.lease_expires_at,
                 spent=spent.get(s.id, {}),
+                create_once=create_once[s.job_id],
             )
         )
         tx.emit(s.job_id, EventKind.SHARD_LEASED, shard_id=s.id, holder=holder, attempt=s.attempts, fence=s.fence)
@@ -142,7 +149,7 @@ def renew(tx: Tx, holder: str, progress: Sequence[LeaseProgress], ttl_s: float) 
     renewals: list[Renewal] = []
     for report in progress:
         row = rows.get(report.shard_id)
-        if row is None or not _is_current(row, report.fence) or row.holder != holder:
+        if row is None or not is_current(row, report.fence) or row.holder != holder:
             renewals.append(Renewal(report.shard_id, "lost"))
             continue
         held.append(report)
@@ -179,27 +186,43 @@ def renew(tx: Tx, holder: str, progress: Sequence[LeaseProgress], ttl_s: float) 
 def holds(tx: Tx, shard: str, fence: int) -> bool:
     """See `Store.holds`."""
     row = tx.first(select(shards.c.state, shards.c.fence).where(shards.c.id == shard))
-    return row is not None and _is_current(row, fence)
+    return row is not None and is_current(row, fence)
 
 
-def blame(tx: Tx, shard: str, fence: int, video_key: str, reason: str) -> int:
+def blame(tx: Tx, shard: str, fence: int, video_key: str, death: Death) -> tuple[Death, ...]:
     """See `Store.blame`. A lease that is not current any more has no say: its deaths are not counted."""
-    row = _lock_shard(tx, shard)
-    video = tx.first(select(videos.c.deaths).where(videos.c.shard_id == shard, videos.c.key == video_key))
+    row = lock_shard(tx, shard)
+    video = tx.first(
+        select(videos.c.deaths, videos.c.death_log).where(videos.c.shard_id == shard, videos.c.key == video_key)
+    )
     if video is None:
         raise ShardNotFound(f"shard {shard} has no video {video_key!r}")
-    if not _is_current(row, fence):
-        return int(video.deaths)
-    deaths = int(video.deaths) + 1
-    tx.run(update(videos).where(videos.c.shard_id == shard, videos.c.key == video_key).values(deaths=deaths))
-    tx.emit(row.job_id, EventKind.VIDEO_BLAMED, shard_id=shard, video_key=video_key, deaths=deaths, reason=reason)
+    if not is_current(row, fence):
+        return _deaths(video)
+    deaths = (*_deaths(video), replace(death, at=tx.now.isoformat()))
+    log = [_storable(each.to_json()) for each in deaths]
+    tx.run(
+        update(videos)
+        .where(videos.c.shard_id == shard, videos.c.key == video_key)
+        .values(deaths=len(deaths), death_log=log)
+    )
+    where = {"place": death.place} if death.place else {}
+    tx.emit(
+        row.job_id,
+        EventKind.VIDEO_BLAMED,
+        shard_id=shard,
+        video_key=video_key,
+        deaths=len(deaths),
+        reason=_storable(death.reason),
+        **where,
+    )
     return deaths
 
 
 def release(tx: Tx, shard: str, fence: int, reason: str, wait_s: float) -> None:
     """See `Store.release`. Nothing happens for a lease that is not current any more."""
-    row = _lock_shard(tx, shard)
-    if _is_current(row, fence):
+    row = lock_shard(tx, shard)
+    if is_current(row, fence):
         _end_lease(tx, row, EventKind.SHARD_RELEASED, wait_s, reason=reason)
         settle_cancelling(tx, row.job_id)
 
@@ -241,7 +264,7 @@ def record_commit(tx: Tx, record: CommitRecord) -> bool:
         ShardNotFound: There is no such shard.
         CommitConflict: The record is not one of this shard's plan and leases.
     """
-    row = _lock_shard(tx, record.shard_id)
+    row = lock_shard(tx, record.shard_id)
     keys = set(tx.run(select(videos.c.key).where(videos.c.shard_id == row.id)).scalars())
     if record.plan_hash != row.plan_hash or {v.key for v in record.videos} != keys or len(record.videos) != len(keys):
         raise CommitConflict(f"the commit record of shard {row.id} belongs to another plan; its output is shared")
@@ -257,6 +280,8 @@ def record_commit(tx: Tx, record: CommitRecord) -> bool:
             state=ShardState.COMMITTED.value,
             tar_name=record.tar_name,
             committed_at=tx.now,
+            record=None,  # it lies in the output
+            record_sha256=hashlib.sha256(record.to_bytes()).hexdigest(),
         )
     )
     tx.run(
@@ -299,11 +324,19 @@ def record_commit(tx: Tx, record: CommitRecord) -> bool:
     return True
 
 
-def _is_current(row: Row[Any], fence: int) -> bool:
+def _deaths(video: Row[Any]) -> tuple[Death, ...]:
+    """Those of which more is known than their number, and before them those of which no more is."""
+    known = tuple(Death(**each) for each in video.death_log or ())
+    return (Death("not recorded"),) * (int(video.deaths) - len(known)) + known
+
+
+def is_current(row: Row[Any], fence: int) -> bool:
+    """Whether a fence is that of the shard's live lease."""
     return ShardState(row.state) is ShardState.LEASED and bool(row.fence == fence)
 
 
-def _lock_shard(tx: Tx, shard: str) -> Row[Any]:
+def lock_shard(tx: Tx, shard: str) -> Row[Any]:
+    """Read a shard's row for a change, its job's row first."""
     job_id = tx.run(select(shards.c.job_id).where(shards.c.id == shard)).scalar_one_or_none()
     if job_id is None:
         raise ShardNotFound(f"there is no shard {shard!r}")

@@ -86,6 +86,7 @@ jobs = Table(
     Column("tenant", String(64), nullable=False),
     Column("spec", Json, nullable=False),
     Column("output", Text, nullable=False),
+    Column("create_once", Boolean),  # whether the output decides between two writers; NULL until it was probed
     Column("state", String(32), nullable=False),
     Column("planned", Boolean, nullable=False, server_default=text("false")),
     # Who plans it, until when.
@@ -195,6 +196,8 @@ shards = Table(
     # The commit.
     Column("tar_name", String(255)),
     Column("committed_at", UtcDateTime),
+    Column("record", Text),  # decided here and not known to lie in the output; see `services.store.commits`
+    Column("record_sha256", String(64)),
     _one_of("state", ShardState),
     UniqueConstraint("job_id", "ordinal"),
     Index("ix_shards_job_id_state_ordinal", "job_id", "state", "ordinal"),
@@ -220,6 +223,15 @@ shards = Table(
     ),
 )
 
+tar_names = Table(
+    "tar_names",
+    metadata,
+    Column("job_id", ForeignKey("jobs.id", ondelete="CASCADE"), primary_key=True),
+    Column("name", String(255), primary_key=True),
+    Column("shard_id", String(64), nullable=False),
+    Column("fence", BigInteger, nullable=False),
+)
+
 videos = Table(
     "videos",
     metadata,
@@ -232,6 +244,7 @@ videos = Table(
     Column("etag", Text),
     Column("status", String(16), nullable=False),
     Column("deaths", Integer, nullable=False, server_default=text("0")),
+    Column("death_log", Json),  # what is known of each of them
     Column("error_code", String(64)),
     Column("result", Json),
     _one_of("status", VideoStatus),

@@ -14,6 +14,7 @@ from services.domain.access import ALL_SCOPES, DEFAULT_TENANT, ApiKey, AuditEntr
 from services.domain.keys import hash_key, new_key
 from services.domain.models import (
     CommitRecord,
+    Death,
     Event,
     Job,
     JobSpec,
@@ -24,7 +25,7 @@ from services.domain.models import (
     ShardPlan,
 )
 from services.domain.states import JobState, VideoStatus
-from services.store import audit, idempotency, jobs, keys, leases, migrations, planning, reading
+from services.store import audit, commits, idempotency, jobs, keys, leases, migrations, planning, reading
 from services.store.base import Deferral, VideoRow
 from services.store.database import Database, Tx
 
@@ -125,14 +126,33 @@ class SqlStore:
     def holds(self, shard_id: str, fence: int) -> bool:
         return self._db.read(lambda tx: leases.holds(tx, shard_id, fence))
 
-    def blame(self, shard_id: str, fence: int, video_key: str, reason: str) -> int:
-        return self._db.write(lambda tx: leases.blame(tx, shard_id, fence, video_key, reason))
+    def blame(self, shard_id: str, fence: int, video_key: str, death: Death) -> tuple[Death, ...]:
+        return self._db.write(lambda tx: leases.blame(tx, shard_id, fence, video_key, death))
 
     def release(self, shard_id: str, fence: int, reason: str, *, wait_s: float = 0.0) -> None:
         self._db.write(lambda tx: leases.release(tx, shard_id, fence, reason, wait_s))
 
     def record_commit(self, record: CommitRecord) -> bool:
         return self._db.write(lambda tx: leases.record_commit(tx, record))
+
+    def settle_commit_point(self, job_id: str, planning_fence: int, create_once: bool) -> bool | None:
+        return self._db.write(lambda tx: commits.settle_commit_point(tx, job_id, planning_fence, create_once))
+
+    def commit_point(self, job_id: str) -> bool | None:
+        return self._db.read(lambda tx: commits.commit_point(tx, job_id))
+
+    def take_tar_name(self, shard_id: str, fence: int, names: Sequence[str]) -> str | None:
+        return self._db.write(lambda tx: commits.take_tar_name(tx, shard_id, fence, names))
+
+    def decide_commit(self, record: CommitRecord) -> bytes | None:
+        return self._db.write(lambda tx: commits.decide(tx, record))
+
+    def decided_commit(self, shard_id: str) -> bytes | None:
+        found = self._db.read(lambda tx: commits.decided_for(tx, shard_id))
+        return None if found is None else found.encode()
+
+    def decided_commits(self, job_id: str) -> list[bytes]:
+        return [record.encode() for record in self._db.read(lambda tx: commits.decided(tx, job_id))]
 
     def expire_leases(self) -> int:
         jobs_to_look_at = self._db.read(leases.expirable_jobs)

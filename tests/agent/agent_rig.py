@@ -49,6 +49,11 @@ class MemorySlot:
         self.before_poll: list[object] = []
         self.dies_idle = False
         self.obeys_cancel = True
+        self.where = "here/slot-0"
+
+    @property
+    def place(self) -> str:
+        return self.where
 
     def start(self, timeout_s: float) -> Died | None:
         if self.start_failures:

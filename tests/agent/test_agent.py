@@ -44,6 +44,10 @@ class ThreadSlot:
         self._replies: list[Reply] = []
         self._done = threading.Event()
 
+    @property
+    def place(self) -> str:
+        return "here/slot-0"
+
     def start(self, timeout_s: float) -> Died | None:
         if self._executor.lost:
             return Died("there is nothing that could start it")

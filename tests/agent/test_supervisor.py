@@ -10,7 +10,7 @@ from agent_rig import Rig
 from services.agent.leases import StopReason
 from services.agent.messages import AnnotateVideo, PackShard, SlotProgress
 from services.domain.errors import CommitConflict, IntegrityError, ServiceError, StorageError, StorageRefused
-from services.domain.models import Lease
+from services.domain.models import Death, Lease
 from services.domain.states import JobState, ShardState, VideoStatus
 from services.storage import open_store
 
@@ -71,10 +71,10 @@ def test_deaths_of_an_earlier_lease_are_remembered(rig: Rig) -> None:
     rig.job({"poison": "die", "b": "frames=3"})
     first = rig.lease()
     for _ in range(2):
-        rig.store.blame(first.lease.shard_id, first.lease.fence, first.lease.videos[0].key, "before")
+        rig.store.blame(first.lease.shard_id, first.lease.fence, first.lease.videos[0].key, Death("before"))
     rig.store.release(first.lease.shard_id, first.lease.fence, "restart")
     live = rig.lease()
-    assert live.lease.spent == {first.lease.videos[0].key: 2}
+    assert {key: len(deaths) for key, deaths in live.lease.spent.items()} == {first.lease.videos[0].key: 2}
     rig.supervisor.work(live)
     assert rig.rows(live)["poison"].status is VideoStatus.QUARANTINED
     assert rig.slot.annotated() == ["b", "poison"]

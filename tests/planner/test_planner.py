@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import json
 import os
 from collections.abc import Iterator
 from pathlib import Path
@@ -191,7 +192,8 @@ class TestJobs:
         assert planned(store, job_id) == [(number, [uri]) for number, uri in enumerate(uris)]
         job = store.get_job(job_id)
         assert job.planned
-        assert (tmp_path / "out" / CLAIM_KEY).read_text() == f'{{"job_id": "{job_id}", "schema_version": 1}}\n'
+        claim = json.loads((tmp_path / "out" / CLAIM_KEY).read_text())
+        assert claim == {"commit_point": "output", "job_id": job_id, "schema_version": 1}
 
     @pytest.mark.parametrize("batches", [0, 1, 2])
     def test_planning_that_was_cut_off_ends_the_same(
@@ -363,10 +365,10 @@ class TestJobs:
         make(videos, "a.mp4")
         job_id, good = (submit(store, tmp_path / name, videos) for name in ("down", "good"))
 
-        def claim(output: ObjectStore, job_id: str) -> None:
+        def claim(output: ObjectStore, job_id: str, *, create_once: bool) -> None:
             if output.uri.endswith("down"):
                 raise error
-            claim_output(output, job_id)
+            claim_output(output, job_id, create_once=create_once)
 
         monkeypatch.setattr("services.planner.planning.claim_output", claim)
         assert plan_next(store, "planner", backoff_base_s=600, backoff_max_s=600)

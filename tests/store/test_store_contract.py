@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from datetime import datetime
+
 import pytest
 from store_helpers import begin_planning, planned_job, plans, record, spec
 
@@ -15,7 +18,7 @@ from services.domain.errors import (
     OutputInUse,
     ShardNotFound,
 )
-from services.domain.models import LeaseProgress, ShardPlan, VideoRef
+from services.domain.models import CommitRecord, Death, LeaseProgress, ShardPlan, VideoRef
 from services.domain.states import JobState, ShardState, VideoStatus
 from services.store.sql import SqlStore
 
@@ -281,7 +284,7 @@ class TestLeases:
         report = [LeaseProgress(old.fence, old.shard_id, frames_done=7)]
         assert store.renew("a", report, ttl_s=60)[0].verdict == "lost"
         store.release(old.shard_id, old.fence, "late")
-        assert store.blame(old.shard_id, old.fence, old.videos[0].key, "late") == 0
+        assert store.blame(old.shard_id, old.fence, old.videos[0].key, Death("late")) == ()
         assert store.holds(new.shard_id, new.fence)
         assert store.expire_leases() == 0
 
@@ -319,18 +322,76 @@ class TestLeases:
         job_id = planned_job(store, 1)
         (lease,) = store.claim("a", limit=1, ttl_s=60)
         key = lease.videos[1].key
-        assert store.blame(lease.shard_id, lease.fence, key, "SIGKILL") == 1
+        (first,) = store.blame(lease.shard_id, lease.fence, key, Death("SIGKILL", "h/slot-0", "a", 1))
+        assert (first.reason, first.place, first.holder, first.attempt) == ("SIGKILL", "h/slot-0", "a", 1)
+        assert datetime.fromisoformat(first.at).tzinfo is not None, "the database's clock says when"
         run_out(store, holder="a", shard_id=lease.shard_id, fence=lease.fence)
         (again,) = store.claim("b", limit=1, ttl_s=60)
-        assert again.spent == {key: 1}
-        assert store.blame(again.shard_id, again.fence, key, "SIGSEGV") == 2
+        assert again.spent == {key: (first,)}
+        both = store.blame(again.shard_id, again.fence, key, Death("SIGSEGV\0", "h/slot-1", "b", 2))
+        assert [death.reason.rstrip("\0\ufffd") for death in both] == ["SIGKILL", "SIGSEGV"]
         blamed = [e.data for e in store.events(job_id) if e.kind == "video.blamed"]
         assert [(d["video_key"], d["deaths"], d["reason"]) for d in blamed] == [
             (key, 1, "SIGKILL"),
-            (key, 2, "SIGSEGV"),
+            (key, 2, "SIGSEGV\ufffd"),
         ]
         with pytest.raises(ShardNotFound):
-            store.blame(again.shard_id, again.fence, "nope", "x")
+            store.blame(again.shard_id, again.fence, "nope", Death("x"))
+
+
+class TestCommitPoint:
+    """The database decides where the output cannot."""
+
+    def test_what_the_probe_found_is_settled_once(self, store: SqlStore) -> None:
+        job, _ = store.create_job(spec())
+        assert store.commit_point(job.id) is None
+        old = begin_planning(store, job.id, ttl_s=0)
+        fence = begin_planning(store, job.id, "other")
+        assert store.settle_commit_point(job.id, old, True) is None
+        assert store.settle_commit_point(job.id, fence, False) is False
+        assert store.settle_commit_point(job.id, fence, True) is False, "all agents go by the first answer"
+        assert store.commit_point(job.id) is False
+        (event,) = [e.data for e in store.events(job.id) if e.kind == "output.probed"]
+        assert event == {"create_once": False, "commit_point": "database"}
+        store.add_shards(job.id, fence, plans(1), ttl_s=60)
+        (lease,) = store.claim("a", limit=1, ttl_s=60)
+        assert not lease.create_once
+        with pytest.raises(JobNotFound):
+            store.commit_point("nope")
+
+    def test_a_tar_name_is_taken_once_in_a_job(self, store: SqlStore) -> None:
+        planned_job(store, 2)
+        first, second = store.claim("a", limit=2, ttl_s=0)
+        assert first.create_once
+        assert store.take_tar_name(first.shard_id, first.fence, ["x", "y"]) == "x"
+        assert store.take_tar_name(first.shard_id, first.fence, ["x", "y"]) == "y"
+        assert store.take_tar_name(second.shard_id, second.fence, ["x", "y"]) is None
+        store.expire_leases()
+        assert store.take_tar_name(first.shard_id, first.fence, ["z"]) is None, "its lease is lost"
+        planned_job(store, 1, output="/other")
+        (elsewhere,) = (x for x in store.claim("a", limit=3, ttl_s=60) if x.spec.output == "/other")
+        assert store.take_tar_name(elsewhere.shard_id, elsewhere.fence, ["x"]) == "x"
+
+    def test_the_first_record_of_a_current_lease_counts(self, store: SqlStore) -> None:
+        job_id = planned_job(store, 1)
+        (zombie,) = store.claim("a", limit=1, ttl_s=0)
+        store.expire_leases()
+        (lease,) = store.claim("b", limit=1, ttl_s=60)
+        assert store.decide_commit(record(zombie)) is None
+        assert store.decided_commit(lease.shard_id) is None
+        winner = record(lease)
+        assert store.decide_commit(winner) == winner.to_bytes()
+        assert store.decide_commit(replace(winner, holder="again")) == winner.to_bytes()
+        assert store.decide_commit(record(zombie)) == winner.to_bytes(), "who comes late learns what counts"
+        assert store.decided_commits(job_id) == [winner.to_bytes()] == [store.decided_commit(lease.shard_id)]
+
+        run_out(store, holder="b", shard_id=lease.shard_id, fence=lease.fence)
+        (again,) = store.claim("c", limit=1, ttl_s=60)
+        assert store.decide_commit(record(again)) == winner.to_bytes(), "it outlives the lease"
+        assert store.record_commit(CommitRecord.from_bytes(winner.to_bytes()))
+        assert store.decided_commits(job_id) == []
+        assert store.decided_commit(lease.shard_id) is None
+        assert store.decide_commit(record(again)) is None, "it is committed"
 
 
 class TestCommit:

@@ -20,7 +20,7 @@ from sqlalchemy import text
 from store_helpers import planned_job, record
 
 from services.domain.errors import JobNotCancellable
-from services.domain.models import Lease, LeaseProgress
+from services.domain.models import Death, Lease, LeaseProgress
 from services.domain.states import JobState, ShardState, VideoStatus
 from services.store.database import Database
 from services.store.sql import SqlStore
@@ -80,7 +80,7 @@ class LeaseProtocol(RuleBasedStateMachine):
             shard = self.shards[lease.ordinal]
             shard.state, shard.holder, shard.fence = ShardState.LEASED, holder, shard.fence + 1
             assert (lease.fence, lease.attempt, lease.holder) == (shard.fence, shard.fence, holder)
-            assert lease.spent == shard.deaths
+            assert {key: len(deaths) for key, deaths in lease.spent.items()} == shard.deaths
         return multiple(*got)
 
     @rule(lease=leases, holder=st.sampled_from(HOLDERS), for_no_time=st.booleans())
@@ -115,7 +115,7 @@ class LeaseProtocol(RuleBasedStateMachine):
         deaths = self.shards[lease.ordinal].deaths
         if self.current(lease):
             deaths[key] = deaths.get(key, 0) + 1
-        assert self.store.blame(lease.shard_id, lease.fence, key, "test") == deaths.get(key, 0)
+        assert len(self.store.blame(lease.shard_id, lease.fence, key, Death("test"))) == deaths.get(key, 0)
 
     @rule(lease=leases, failed=st.booleans())
     def commit(self, lease: Lease, failed: bool) -> None:
