@@ -8,6 +8,7 @@
     hang                 never comes back
     slow=SECONDS         takes its time, reporting progress
     flaky=PATH           a retryable typed error, once
+    leak=MIB             keeps so much memory for ever
     count=PATH           appends a line to PATH before anything else
 
 They write real artifacts with the engine's own writer, so that everything behind them is the real thing.
@@ -31,6 +32,7 @@ from vipe_core.errors import ConfigError, CorruptMedia, DecodeCrashed
 from vipe_core.formats import write_artifacts
 
 WIDTH, HEIGHT = 16, 12
+_LEAKED: list[bytes] = []
 
 
 class ProcessDeath(BaseException):
@@ -54,6 +56,8 @@ class ScriptedEngine:
         if "count" in script:
             with Path(script["count"]).open("a") as log:
                 log.write(f"{video.key}\n")
+        if "leak" in script:
+            _LEAKED.append(b"x" * (int(script["leak"]) << 20))
         if "error" in script:
             raise CorruptMedia(f"{path}: not a video")
         if "bug" in script:

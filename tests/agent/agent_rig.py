@@ -140,7 +140,7 @@ class Rig:
             self.clock.sleep,
         )
 
-    def job(self, scripts: dict[str, str], *, preset: str = "classical") -> str:
+    def job(self, scripts: dict[str, str], *, preset: str = "classical", create_once: bool = True) -> str:
         """A planned job of one shard, one "video" for each name and script; its id."""
         inputs = self.root / "inputs"
         inputs.mkdir(exist_ok=True)
@@ -155,6 +155,7 @@ class Rig:
         job, _ = self.store.create_job(spec)
         fence = self.store.begin_planning(job.id, "planner", ttl_s=60)
         assert fence is not None
+        self.store.settle_commit_point(job.id, fence, create_once)
         self.store.add_shards(job.id, fence, [ShardPlan(0, tuple(videos))], ttl_s=60)
         self.store.finish_planning(job.id, fence)
         return job.id
