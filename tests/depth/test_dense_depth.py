@@ -220,10 +220,19 @@ def test_every_pixel_says_where_its_depth_comes_from(
         assert (frame.kind == MEASURED).mean() > 0.5
         assert frame.confidence[frame.kind == MEASURED].mean() > 2 * frame.confidence[frame.kind == FILLED].mean()
         assert not frame.moving.any()
+
+
+def test_what_moves_is_marked_and_a_mask_over_what_is_static_is_not(sideways: SyntheticClip) -> None:
     labels = np.full((len(sideways.rgb), 30 * 40), STATIC, np.int8)
     labels.reshape(-1, 30, 40)[:, 10:18, 12:22] = SOMETHING_MOVES
     scene = dataclasses.replace(scene_of(sideways), labels=labels)
-    frame = next(DenseDepth(SETTINGS).stream(ClipSource(sideways.rgb), scene))
+    changing = sideways.rgb.copy()
+    noise = np.random.default_rng(0).integers(0, 255, (len(changing), 16, 20, 3), np.uint8)
+    for picture, blocks in zip(changing, noise, strict=True):
+        picture[80:144, 96:176] = cv2.resize(blocks, (80, 64), interpolation=cv2.INTER_CUBIC)
+    frame = next(DenseDepth(SETTINGS).stream(ClipSource(changing), scene))
     assert np.array_equal(frame.kind == MOVING, frame.moving)
     assert frame.moving[88:136, 104:168].mean() > 0.5
     assert not frame.moving[:60].any()
+    frame = next(DenseDepth(SETTINGS).stream(ClipSource(sideways.rgb), scene))
+    assert frame.moving.mean() < 0.01

@@ -7,7 +7,7 @@ import numpy as np
 from vipe_core.cameras import Camera
 from vipe_core.depth.consistency import confirm
 from vipe_core.depth.geometry import Prior, View
-from vipe_core.depth.moving import stand
+from vipe_core.depth.moving import stand, unrefuted
 from vipe_core.depth.sweep import RawDepth
 from vipe_core.depth.types import DepthSettings
 
@@ -44,6 +44,31 @@ def test_what_is_measured_as_static_stays() -> None:
     thing = np.zeros((HEIGHT, WIDTH), np.bool_)
     thing[10:45, 20:35] = True
     assert np.array_equal(stand(scene, thing, np.ones_like(thing)), scene)
+
+
+def test_a_mask_over_what_is_measured_as_static_is_refuted() -> None:
+    rng = np.random.default_rng(0)
+    moving = np.zeros((HEIGHT, WIDTH), np.bool_)
+    moving[:, 10:30] = moving[:, 50:70] = True
+    measured = rng.random((HEIGHT, WIDTH)) < np.where(np.arange(WIDTH) < 40, 0.8, 0.03)
+    found = unrefuted(moving, measured)
+    assert not found[:, 10:30].any()
+    assert np.array_equal(found[:, 50:70], moving[:, 50:70])
+    assert not found[~moving].any()
+
+
+def test_other_frames_refute_a_mask_only_where_enough_of_them_agree() -> None:
+    view = View.of(Camera.pinhole_from_fov(60, WIDTH, HEIGHT))
+    ones = np.ones((HEIGHT, WIDTH), np.float32)
+    prior = Prior(0.5 * ones[:8, :8], ones[:8, :8], 0.3, 0.8)
+    raw = RawDepth(0.5 * ones, 0.9 * ones, 0.4 * ones, True)
+    masked = np.zeros((HEIGHT, WIDTH), np.bool_)
+    masked[10:50, 10:60] = True
+    two, three = (confirm(raw, [(np.eye(4), raw)] * n, view, prior, masked, DepthSettings()) for n in (2, 3))
+    assert np.array_equal(two.moving, masked)
+    assert not two.belief[masked].any()
+    assert not three.moving.any()
+    assert (three.belief > 0.8).all()
 
 
 def test_only_what_others_agree_with_is_believed() -> None:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from vipe_core.depth.geometry import Prior, View
 from vipe_core.depth.kernels import check
+from vipe_core.depth.moving import unrefuted
 from vipe_core.depth.sweep import RawDepth
 from vipe_core.depth.types import DepthSettings
 
@@ -42,11 +43,13 @@ class Confirmed:
         inverse_depth: (h, w) float32, the mean of those who agree.
         belief: (h, w) float32 in 0..1; 0 where too few agree.
         weight: (h, w) float32 as a measurement: the belief squared, and a little where nobody could be asked.
+        moving: (h, w) bool, what seems to move after the other frames were asked.
     """
 
     inverse_depth: NDArray[np.float32]
     belief: NDArray[np.float32]
     weight: NDArray[np.float32]
+    moving: NDArray[np.bool_]
 
 
 def confirm(
@@ -86,8 +89,9 @@ def confirm(
             ratios,
         )
     share = votes / np.maximum(asked - hidden, 1)
-    believed = (asked > 0) & (share >= _MIN_SHARE) & (votes >= np.where(raw.score > _SURE_SCORE, 1, _MIN_VOTES))
-    believed &= ~moving | (votes >= _SURE_VOTES)
+    agreed = (asked > 0) & (share >= _MIN_SHARE)
+    moving = unrefuted(moving, agreed & (votes >= _SURE_VOTES))
+    believed = agreed & (votes >= np.where(moving, _SURE_VOTES, np.where(raw.score > _SURE_SCORE, 1, _MIN_VOTES)))
     believed = _without_specks(value, believed)
     score = np.clip((raw.score - _MIN_SCORE) / (_SURE_SCORE - _MIN_SCORE), 0, 1)
     distinct = np.clip(raw.margin / _SURE_MARGIN, _LEAST_DISTINCT, 1)
@@ -95,7 +99,7 @@ def confirm(
     belief[belief < _MIN_BELIEF] = 0
     alone = (asked == 0) & ~moving
     weight = np.where(alone, _LONE_BELIEF * score * distinct, belief) ** 2
-    return Confirmed((value * (1 + ratios) / (1 + votes)).astype(np.float32), belief, weight.astype(np.float32))
+    return Confirmed((value * (1 + ratios) / (1 + votes)).astype(np.float32), belief, weight.astype(np.float32), moving)
 
 
 def _without_specks(inverse_depth: Array, kept: NDArray[np.bool_]) -> NDArray[np.bool_]:

@@ -1,4 +1,7 @@
-"""Depth of what moves by itself, for which no other frame can be asked: it stands where it touches the static scene."""
+"""What moves by itself: whether it does, and its depth, for which no other frame can be asked.
+
+It stands where it touches the static scene.
+"""
 
 from __future__ import annotations
 
@@ -15,6 +18,28 @@ _CONTACT_PX = 4
 # Of a small piece at the border nobody can tell, and the scene is continued into it.
 _CUT_OFF_QUANTILE, _MIN_CUT_OFF_AREA = 0.8, 0.04
 _MIN_PIXELS = 10
+# What seems to move is taken for static where most of it is measured, within windows of this share of the width.
+_MOST, _WINDOW = 0.5, 0.1
+
+
+def unrefuted(moving: NDArray[np.bool_], measured: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """What seems to move, less the parts that are measured as static.
+
+    Masks come from the flow between keyframes, which fails on what passes by fast or repeats; that other frames see
+    the same depth through their static geometry happens to no thing that moves by itself, but for a few pixels.
+
+    Args:
+        moving: (h, w) bool.
+        measured: (h, w) bool, where enough frames agree on one depth.
+    """
+    if not (moving & measured).any():
+        return moving
+    side = 2 * round(_WINDOW * moving.shape[1] / 2) + 1
+    masked, refuted = (
+        cv2.boxFilter(area.astype(np.float32), -1, (side, side), borderType=cv2.BORDER_CONSTANT)
+        for area in (moving, moving & measured)
+    )
+    return np.asarray(moving & (refuted <= _MOST * masked))
 
 
 def stand(
@@ -53,6 +78,8 @@ def stand(
             nearness = _CUT_OFF_QUANTILE
             if thing.mean() < _MIN_CUT_OFF_AREA:
                 continue
+        # What is only filled in may itself be a guess about something that moves.
+        ground &= measured
         if ground.sum() >= _MIN_PIXELS:
             out[thing] = np.quantile(inverse_depth[ground], nearness)
     return out

@@ -55,12 +55,14 @@ class _Picture:
     Attributes:
         rgb: (h, w, 3) uint8.
         gray: (h, w) uint8.
-        moving: (h, w) bool, what moves by itself or must not be used.
+        moving: (h, w) bool, what seems to move by itself or must not be used.
+        unusable: (h, w) bool, the latter alone.
     """
 
     rgb: NDArray[np.uint8]
     gray: NDArray[np.uint8]
     moving: NDArray[np.bool_]
+    unusable: NDArray[np.bool_]
 
 
 class DenseDepth:
@@ -97,7 +99,7 @@ class DenseDepth:
                     priors[t] = keyframes.of(t)
                     chosen = choose_sources(scene, sweep.coarse, priors[t], t, settings)
                     raws[t] = sweep.depth(
-                        t, pictures[t].gray, {j: (pictures[j].gray, pictures[j].moving) for j in chosen}, priors[t]
+                        t, pictures[t].gray, {j: (pictures[j].gray, pictures[j].unusable) for j in chosen}, priors[t]
                     )
                 done = t - reach
                 if done >= 0:
@@ -130,32 +132,39 @@ class DenseDepth:
                 if start <= j < stop and raws[j].measured
             ]
             found = confirm(raw, others, sweep.fine, prior, picture.moving, settings)
-            value, confidence, kind = self._completed(found, picture, prior_value, prior_trust)
+            moving = found.moving | picture.unusable
+            value, confidence, kind = self._completed(found, moving, picture, prior_value, prior_trust)
         else:
+            moving = picture.moving
             value, confidence = prior_value, _PRIOR_SHARE * prior_trust
             kind = np.where(prior_trust > 0, FILLED, UNOBSERVED)
-        kind = np.where(picture.moving, MOVING, kind).astype(np.uint8)
-        confidence = np.where(picture.moving, 0, confidence).astype(np.float32)
+        kind = np.where(moving, MOVING, kind).astype(np.uint8)
+        confidence = np.where(moving, 0, confidence).astype(np.float32)
         value = np.clip(value, _FAR_LIMIT * prior.low, _NEAR_LIMIT * prior.high).astype(np.float32)
         full_gray = cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY)
         depth, sure = upsample(value, confidence, gray, full_gray, _EDGE, _SAME)
         kind = np.asarray(cv2.resize(kind, full_gray.shape[::-1], interpolation=cv2.INTER_NEAREST), np.uint8)
-        moving = kind == MOVING
+        masked = kind == MOVING
         if frame.masked is not None:
-            moving |= frame.masked
-            kind[moving] = MOVING
-        return DepthFrame(index, frame.rgb, depth, np.clip(sure, 0, 1), kind, moving)
+            masked |= frame.masked
+            kind[masked] = MOVING
+        return DepthFrame(index, frame.rgb, depth, np.clip(sure, 0, 1), kind, masked)
 
     def _completed(
-        self, found: Confirmed, picture: _Picture, prior_value: Array, prior_trust: Array
+        self,
+        found: Confirmed,
+        moving: NDArray[np.bool_],
+        picture: _Picture,
+        prior_value: Array,
+        prior_trust: Array,
     ) -> tuple[Array, NDArray[np.float32], NDArray[np.uint8]]:
         """Inverse depth of every pixel, how sure it is, and where it comes from."""
         settings = self._settings
-        sky = find_sky(picture.rgb, found.inverse_depth, found.belief, picture.moving)
+        sky = find_sky(picture.rgb, found.inverse_depth, found.belief, moving)
         measured = (found.belief > 0) & ~sky
         # Where nothing is measured, what bundle adjustment found is a hint.
         unknown = found.weight == 0
-        weight = np.where(unknown, np.where(picture.moving, 0, _HINT * prior_trust**_HINT_POWER), found.weight)
+        weight = np.where(unknown, np.where(moving, 0, _HINT * prior_trust**_HINT_POWER), found.weight)
         if not (weight[~sky] > 0).any():
             return prior_value, np.zeros_like(found.belief), np.full(sky.shape, UNOBSERVED, np.uint8)
         value = complete(
@@ -167,7 +176,7 @@ class DenseDepth:
             settings.fill_edge,
             settings.fill_tolerance,
         )
-        value = stand(value, picture.moving, measured)
+        value = stand(value, moving, measured)
         # OpenCV's differs in the last bit with the number of its threads.
         away_px = distance_transform_edt(~measured)
         reach_px = _FILL_REACH * sky.shape[1]
@@ -182,13 +191,14 @@ class DenseDepth:
 def _half(frame: Frame, scene: SceneMap) -> _Picture:
     height, width = frame.rgb.shape[0] // 2, frame.rgb.shape[1] // 2
     rgb = np.asarray(cv2.resize(frame.rgb, (width, height), interpolation=cv2.INTER_AREA), np.uint8)
-    moving = np.zeros((height, width), np.bool_)
+    unusable = np.zeros((height, width), np.bool_)
+    if frame.masked is not None:
+        unusable |= cv2.resize(frame.masked.astype(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST) > 0
+    moving = unusable.copy()
     if scene.labels is not None:
         grid = Grid(scene.camera.height // 8, scene.camera.width // 8)
         moving |= segment(rgb, scene.labels[frame.index], grid) > 0
-    if frame.masked is not None:
-        moving |= cv2.resize(frame.masked.astype(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST) > 0
-    return _Picture(rgb, np.asarray(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), np.uint8), moving)
+    return _Picture(rgb, np.asarray(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), np.uint8), moving, unusable)
 
 
 def _next(frames: Iterator[Frame], index: int, num_frames: int) -> Frame:
