@@ -16,6 +16,7 @@ from video_clips import number_of, picture, set_display_rotation, write_clip
 from vipe_core.errors import UnsupportedMedia
 from vipe_core.video import Limits, VideoFileSource, open_source, probe
 from vipe_core.video.av_decode import Clock, Damage, decode
+from vipe_core.video.opened import open_media
 
 
 def test_every_frame_arrives_once_in_order_with_its_time(tmp_path: Path) -> None:
@@ -216,7 +217,7 @@ def test_a_one_frame_video(tmp_path: Path) -> None:
 def test_a_file_name_cannot_be_taken_for_a_protocol_or_pattern(tmp_path: Path) -> None:
     for name in ("concat:a|b.mp4", "frame%03d.mp4", "é ü.mp4", "-y.mp4"):
         write_clip(tmp_path / "plain.mp4", 2).rename(tmp_path / name)
-        assert len(list(decode(str(tmp_path / name), Limits(), 1, Damage(), lambda: None))) == 2
+        assert len(list(decode(open_media(str(tmp_path / name), Limits()), Limits(), 1, Damage(), lambda: None))) == 2
 
 
 @given(st.lists(st.one_of(st.none(), st.floats(-1e6, 1e6), st.just(float("nan"))), max_size=40))

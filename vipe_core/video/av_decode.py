@@ -1,7 +1,7 @@
 """Decoding with FFmpeg (PyAV), as it runs inside of the decoder child: open safely, describe, decode, convert.
 
-Nothing in a media file may make FFmpeg open a second file or a URL: only the `file` protocol and self-contained
-containers are allowed, so a playlist is refused instead of followed.
+Nothing in a media file may make FFmpeg open a second file or a URL: the file is open already and read through Python,
+no protocol at all is allowed, and only self-contained containers are: a playlist is refused instead of followed.
 """
 
 from __future__ import annotations
@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 import av
@@ -21,15 +20,17 @@ from av.video.reformatter import ColorRange, Colorspace, Interpolation, VideoRef
 from av.video.stream import VideoStream
 from numpy.typing import NDArray
 
-from vipe_core.errors import CorruptMedia, EmptyMedia, InputError, NoVideoStream, UnsupportedMedia
+from vipe_core.errors import CorruptMedia, EmptyMedia, InputError, MediaTooLarge, NoVideoStream, UnsupportedMedia
 from vipe_core.video.limits import Limits
+from vipe_core.video.opened import OpenedMedia
 
 # Self-contained containers. The audio ones are here so that an audio file is named as such.
 _FORMATS = (
     "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm,avi,mpegts,mpeg,mpegvideo,flv,ogg,asf,gif,ivf,h264,hevc,nut,"
     "wav,mp3,aac,flac,aiff"
 )
-_OPTIONS = {"protocol_whitelist": "file", "format_whitelist": _FORMATS}
+_OPTIONS = {"protocol_whitelist": "none", "format_whitelist": _FORMATS}
+_READ_BYTES = 1 << 18
 
 _PLAYLIST_HEADS = (
     b"#extm3u",
@@ -84,22 +85,30 @@ class Damage:
         return "; ".join(parts) or None
 
 
-def open_video(path: str) -> tuple[InputContainer, VideoStream]:
+def open_video(media: OpenedMedia, limits: Limits) -> tuple[InputContainer, VideoStream]:
     """Open the container and choose its video stream (the largest that is not a cover picture).
 
     Raises:
-        EmptyMedia, CorruptMedia, NoVideoStream, UnsupportedMedia: Typed, naming the file.
+        EmptyMedia, CorruptMedia, NoVideoStream, UnsupportedMedia, MediaTooLarge: Typed, naming the file.
     """
-    label = Path(path).name
+    label = media.label
+    media.file.seek(0)
+    options = {**_OPTIONS, "max_streams": str(limits.max_streams)}
     try:
-        container = av.open(path, mode="r", options=dict(_OPTIONS), metadata_errors="ignore")
+        # The file's name goes along: its suffix decides between containers that look alike.
+        container = av.open(media.file, mode="r", options=options, metadata_errors="ignore", buffer_size=_READ_BYTES)
+    except (MemoryError, av.error.MemoryError) as error:
+        raise limits.out_of_memory(label) from error
     except av.error.FFmpegError as error:
-        raise _open_error(path, label, error) from error
+        raise _open_error(media, error) from error
+    if len(container.streams) >= limits.max_streams:
+        container.close()
+        raise MediaTooLarge(f"{label}: the file holds {limits.max_streams} streams or more; keep only the video")
     streams = [stream for stream in container.streams.video if not _is_cover(stream)]
     if not streams:
         name = container.format.name
         container.close()
-        if name in ("mp3", "aac") and not _starts_like_mpeg_audio(path):
+        if name in ("mp3", "aac") and not _starts_like_mpeg_audio(media):
             # Probing by content takes arbitrary bytes for MPEG audio now and then.
             raise CorruptMedia(f"{label}: not a media file; check that the upload is complete")
         raise NoVideoStream(f"{label}: the file holds no video stream; provide a file with pictures")
@@ -107,18 +116,19 @@ def open_video(path: str) -> tuple[InputContainer, VideoStream]:
     return container, stream
 
 
-def describe(path: str, limits: Limits) -> Description:
+def describe(media: OpenedMedia, limits: Limits) -> Description:
     """Open, decode the first picture and report. Frame count and duration are the container's claims.
 
     Raises:
         InputError: Typed, naming the file.
     """
-    label = Path(path).name
-    container, stream = open_video(path)
+    label = media.label
+    container, stream = open_video(media, limits)
     with container:
         limits.check_picture(label, stream.codec_context.width, stream.codec_context.height)
         duration_s = _duration_s(container, stream)
         limits.check_length(label, stream.frames or None, duration_s)
+        limits.check_decoded(label, stream.frames, stream.codec_context.width, stream.codec_context.height)
         first = next(_pictures(container, stream, label, limits, 1, Damage()), None)
         if first is None:
             raise _no_picture(label, stream)
@@ -137,7 +147,7 @@ def describe(path: str, limits: Limits) -> Description:
 
 
 def decode(
-    path: str,
+    media: OpenedMedia,
     limits: Limits,
     threads: int,
     damage: Damage,
@@ -151,15 +161,19 @@ def decode(
     Raises:
         InputError: Typed, naming the file; CorruptMedia or EmptyMedia when there is no picture at all.
     """
-    label = Path(path).name
-    container, stream = open_video(path)
+    label = media.label
+    container, stream = open_video(media, limits)
     with container:
         limits.check_picture(label, stream.codec_context.width, stream.codec_context.height)
         clock = Clock(1.0 / _fps(stream))
         index = -1
+        begin_s: float | None = None
         for index, frame in enumerate(_pictures(container, stream, label, limits, threads, damage, on_progress)):
-            limits.check_length(label, index + 1, None)
-            yield index, clock.repaired(_timestamp_s(frame)), frame
+            timestamp_s = clock.repaired(_timestamp_s(frame))
+            begin_s = timestamp_s if begin_s is None else begin_s
+            limits.check_length(label, index + 1, timestamp_s - begin_s)
+            limits.check_decoded(label, index + 1, frame.width, frame.height)
+            yield index, timestamp_s, frame
         if index < 0:
             raise _no_picture(label, stream)
 
@@ -299,17 +313,25 @@ def _pictures(
     context.thread_type = "AUTO" if threads > 1 else "NONE"
     context.options = {"max_pixels": str(limits.max_pixels)}
     packets = container.demux(stream)
+    without_picture = 0
     while True:
         try:
             packet = next(packets)
         except StopIteration:
             return
+        except (MemoryError, av.error.MemoryError) as error:
+            raise limits.out_of_memory(label) from error
         except av.error.FFmpegError:
             damage.cut_short = True
             packet = None
         on_progress()
+        without_picture += 1
+        if without_picture > limits.max_frames:
+            raise CorruptMedia(f"{label}: {limits.max_frames} packets in a row hold no picture; re-encode the video")
         try:
             frames = context.decode(packet)
+        except (MemoryError, av.error.MemoryError) as error:
+            raise limits.out_of_memory(label) from error
         except (av.error.DecoderNotFoundError, av.error.PatchWelcomeError) as error:
             raise UnsupportedMedia(f"{label}: codec {context.name} cannot be decoded here; re-encode it") from error
         except (av.error.FFmpegError, ValueError):
@@ -318,6 +340,7 @@ def _pictures(
         if packet is not None and packet.is_corrupt:
             damage.cut_short = True
         for frame in frames:
+            without_picture = 0
             if frame.is_corrupt:
                 damage.bad_pictures += 1
             else:
@@ -358,18 +381,18 @@ def _no_picture(label: str, stream: VideoStream) -> InputError:
     )
 
 
-def _head(path: str, count: int = 4096) -> bytes:
-    with Path(path).open("rb") as file:
-        return file.read(count)
+def _head(media: OpenedMedia, count: int = 4096) -> bytes:
+    media.file.seek(0)
+    return media.file.read(count)
 
 
-def _starts_like_mpeg_audio(path: str) -> bool:
-    head = _head(path, 4)
+def _starts_like_mpeg_audio(media: OpenedMedia) -> bool:
+    head = _head(media, 4)
     return head[:3] == b"ID3" or (len(head) > 1 and head[0] == 0xFF and head[1] >= 0xE0)
 
 
-def _open_error(path: str, label: str, error: av.error.FFmpegError) -> InputError:
-    head = _head(path)
+def _open_error(media: OpenedMedia, error: av.error.FFmpegError) -> InputError:
+    head, label = _head(media), media.label
     if head.lstrip(b"\xef\xbb\xbf \t\r\n").lower().startswith(_PLAYLIST_HEADS):
         return UnsupportedMedia(f"{label}: playlists and manifests are not followed; provide the media file itself")
     if head.startswith(_IMAGE_HEADS) or (head[:4] == b"RIFF" and head[8:12] == b"WEBP"):

@@ -7,10 +7,10 @@ parent can kill. The process ends itself when its parent is gone (end of file on
 
 from __future__ import annotations
 
+import importlib
 import json
 import math
 import os
-import resource
 import signal
 import sys
 import threading
@@ -21,11 +21,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vipe_core.errors import DecodeError, VipeError
+from vipe_core.video.opened import OpenedMedia, open_media
+from vipe_core.video.sandbox import restrict
 from vipe_core.video.wire import DOCUMENT, HEARTBEAT, PICTURE, Header, Request, error_document, write_all
 
 _HEARTBEAT_S = 0.5
-# Enough for a group of pictures each in an hour of video, and far below the size limit of a document.
-_MAX_WRITTEN_FILE_BYTES = 1 << 20
 
 
 class _Link:
@@ -61,45 +61,57 @@ class _Link:
         self._send(Header(PICTURE, rgb.nbytes, width, height, index, timestamp_s), rgb.data)
 
 
-def _probe(request: Request, link: _Link) -> None:
-    if request.images:
-        from vipe_core.video.image_decode import read_image
+def _probe_video(media: list[OpenedMedia], request: Request, link: _Link, protections: tuple[str, ...]) -> None:
+    from vipe_core.video.av_decode import describe
 
-        height, width = read_image(request.paths[0], request.limits).shape[:2]
-        link.document(json.dumps({"info": {"width": width, "height": height}}).encode())
-    else:
-        from vipe_core.video.av_decode import describe
-
-        info = asdict(describe(request.paths[0], request.limits))
-        link.document(json.dumps({"info": info}).encode())
+    info = asdict(describe(media[0], request.limits))
+    link.document(json.dumps({"info": info, "protections": protections}).encode())
 
 
-def _decode_images(request: Request, link: _Link) -> None:
+def _probe_image(media: list[OpenedMedia], request: Request, link: _Link, protections: tuple[str, ...]) -> None:
+    from vipe_core.video.image_decode import read_image
+
+    height, width = read_image(media[0], request.limits).shape[:2]
+    link.document(json.dumps({"info": {"width": width, "height": height}, "protections": protections}).encode())
+
+
+def _decode_images(media: list[OpenedMedia], request: Request, link: _Link) -> None:
     from vipe_core.video.image_decode import read_images
 
-    images = read_images(
-        request.paths, request.limits, request.size, request.start, request.stop, on_progress=link.progress
-    )
+    images = read_images(media, request.limits, request.size, request.start, request.stop, on_progress=link.progress)
     for index, rgb in images:
         link.picture(index, index / request.fps, rgb)
     link.document(b'{"end": true}')
 
 
-def _decode_video(request: Request, link: _Link) -> None:
-    from pathlib import Path
-
+def _decode_video(media: list[OpenedMedia], request: Request, link: _Link) -> None:
     from vipe_core.video.av_decode import Damage, PictureConverter, decode
 
     damage = Damage()
-    path = request.paths[0]
-    converter = PictureConverter(Path(path).name, request.size, request.limits)
-    for index, timestamp_s, frame in decode(path, request.limits, request.threads, damage, link.progress):
+    converter = PictureConverter(media[0].label, request.size, request.limits)
+    for index, timestamp_s, frame in decode(media[0], request.limits, request.threads, damage, link.progress):
         if index >= request.start:
             link.picture(index, timestamp_s, converter.convert(frame))
         if request.stop is not None and index + 1 >= request.stop:
             link.document(b'{"end": true}')
             return
     link.document(json.dumps({"end": True, "damage": damage.sentence()}).encode())
+
+
+def _run(request: Request, link: _Link) -> None:
+    """Import and open what is needed, give up the rest, then look at the bytes."""
+    importlib.import_module("vipe_core.video.image_decode" if request.images else "vipe_core.video.av_decode")
+    inside = request.root if request.images else None
+    media = [open_media(path, request.limits, inside=inside) for path in request.paths]
+    protections = restrict(request.limits.max_memory_bytes)
+    threading.Thread(target=_exit_with_parent, daemon=True).start()
+    try:
+        if request.task == "probe":
+            (_probe_image if request.images else _probe_video)(media, request, link, protections)
+        else:
+            (_decode_images if request.images else _decode_video)(media, request, link)
+    except MemoryError:
+        raise request.limits.out_of_memory(request.files[0]) from None
 
 
 def _exit_with_parent() -> None:
@@ -111,20 +123,16 @@ def _exit_with_parent() -> None:
 def main() -> None:
     request = Request.from_json(sys.argv[1])
     link = _Link(int(sys.argv[2]), request.stall_s)
-    threading.Thread(target=_exit_with_parent, daemon=True).start()
-    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-    resource.setrlimit(resource.RLIMIT_FSIZE, (_MAX_WRITTEN_FILE_BYTES, _MAX_WRITTEN_FILE_BYTES))
     link.started()
-    task = _probe if request.task == "probe" else _decode_images if request.images else _decode_video
     try:
-        task(request, link)
+        _run(request, link)
     except BrokenPipeError:
         # The parent stopped reading: there is nobody left to tell.
         pass
     except VipeError as error:
         link.document(error_document(error))
-    except MemoryError:
-        link.document(error_document(DecodeError(f"{request.files[0]}: out of memory while decoding; try again")))
+    except OSError as error:
+        link.document(error_document(DecodeError(f"{request.files[0]}: {error.strerror or error}; try again")))
     # Native threads of the codecs need no orderly end, and an orderly end is where they hang.
     os._exit(0)
 

@@ -3,29 +3,26 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from pathlib import Path
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from vipe_core.errors import CorruptMedia, MediaNotFound, MediaTooLarge
+from vipe_core.errors import CorruptMedia, MediaTooLarge
 from vipe_core.video.limits import Limits
+from vipe_core.video.opened import OpenedMedia
 
 
-def read_image(path: str, limits: Limits) -> NDArray[np.uint8]:
+def read_image(media: OpenedMedia, limits: Limits) -> NDArray[np.uint8]:
     """(H, W, 3) uint8 RGB, upright after EXIF; grey is repeated, 16 bit keeps its upper 8, alpha is dropped.
 
     Raises:
         CorruptMedia: The file cannot be decoded; names it.
-        MediaNotFound: It is gone, or may not be read.
         MediaTooLarge: The picture exceeds `limits`.
     """
-    label = Path(path).name
-    try:
-        data = np.fromfile(path, dtype=np.uint8)
-    except OSError as error:
-        raise MediaNotFound(f"{label}: {error.strerror or 'cannot be read'}; check the path") from error
+    label = media.label
+    media.file.seek(0)
+    data = np.frombuffer(media.file.read(), dtype=np.uint8)
     try:
         bgr = cv2.imdecode(data, cv2.IMREAD_COLOR) if len(data) else None
     except cv2.error as error:
@@ -42,7 +39,7 @@ def read_image(path: str, limits: Limits) -> NDArray[np.uint8]:
 
 
 def read_images(
-    paths: Sequence[str],
+    images: Sequence[OpenedMedia],
     limits: Limits,
     size: tuple[int, int] | None,
     start: int,
@@ -54,13 +51,13 @@ def read_images(
     Raises:
         CorruptMedia: An image cannot be decoded, or is not of the size of the first one; names it.
     """
-    first = read_image(paths[0], limits)
-    for index in range(start, min(len(paths), len(paths) if stop is None else stop)):
-        rgb = first if index == 0 else read_image(paths[index], limits)
+    first = read_image(images[0], limits)
+    for index in range(start, min(len(images), len(images) if stop is None else stop)):
+        rgb = first if index == 0 else read_image(images[index], limits)
         on_progress()
         if rgb.shape != first.shape:
             raise CorruptMedia(
-                f"{Path(paths[index]).name}: {rgb.shape[1]}x{rgb.shape[0]} pixels where the first image has "
+                f"{images[index].label}: {rgb.shape[1]}x{rgb.shape[0]} pixels where the first image has "
                 f"{first.shape[1]}x{first.shape[0]}; all images must have one size"
             )
         if size is not None and size != (rgb.shape[1], rgb.shape[0]):

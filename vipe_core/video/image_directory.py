@@ -9,7 +9,7 @@ from vipe_core.errors import EmptyMedia, MediaNotFound
 from vipe_core.video.limits import Limits
 from vipe_core.video.naming import sanitise_name
 from vipe_core.video.probe import is_directory
-from vipe_core.video.process import DecoderProcess
+from vipe_core.video.process import DecoderProcess, report_protections
 from vipe_core.video.source import Frame, FrameStream, VideoInfo
 from vipe_core.video.video_file import STALL_S, check_range
 from vipe_core.video.wire import Request
@@ -62,7 +62,9 @@ class ImageDirectorySource:
         with DecoderProcess(
             self._request("probe", self._files[:1], fps, None, 0, None), self._root.name, stall_s, stall_s
         ) as child:
-            size = child.document()["info"]
+            document = child.document()
+        report_protections(document)
+        size = document["info"]
         try:
             size_bytes = sum(file.stat().st_size for file in self._files)
         except OSError as error:

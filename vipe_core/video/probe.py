@@ -5,10 +5,11 @@ from __future__ import annotations
 import stat
 from pathlib import Path
 
-from vipe_core.errors import EmptyMedia, MediaNotFound, UnsupportedMedia
+from vipe_core.errors import EmptyMedia, UnsupportedMedia
 from vipe_core.video.limits import Limits
 from vipe_core.video.naming import sanitise_name
-from vipe_core.video.process import DecoderProcess
+from vipe_core.video.opened import not_found
+from vipe_core.video.process import DecoderProcess, report_protections
 from vipe_core.video.source import VideoInfo
 from vipe_core.video.wire import Request
 
@@ -26,7 +27,7 @@ def is_directory(path: Path) -> bool:
     except FileNotFoundError:
         return False
     except (OSError, ValueError) as error:
-        raise _not_found(path, error) from error
+        raise not_found(path.name, error) from error
 
 
 def file_size_bytes(path: Path) -> int:
@@ -42,17 +43,12 @@ def file_size_bytes(path: Path) -> int:
         if stat.S_ISREG(status.st_mode):
             path.open("rb").close()
     except (OSError, ValueError) as error:
-        raise _not_found(path, error) from error
+        raise not_found(path.name, error) from error
     if not stat.S_ISREG(status.st_mode):
         raise UnsupportedMedia(f"{path.name}: not a regular file; provide a video file or a directory of images")
     if status.st_size == 0:
         raise EmptyMedia(f"{path.name}: the file has zero bytes; check that the upload is complete")
     return status.st_size
-
-
-def _not_found(path: Path, error: OSError | ValueError) -> MediaNotFound:
-    reason = (error.strerror if isinstance(error, OSError) else None) or "cannot be opened"
-    return MediaNotFound(f"{path.name}: {reason}; check the path")
 
 
 def probe(
@@ -61,7 +57,7 @@ def probe(
     """Describe a video file.
 
     Args:
-        path: A regular file. It is opened with the `file` protocol and self-contained containers only.
+        path: A regular file. Only self-contained containers are opened, and nothing that they refer to.
         limits: Bounds on picture size and length; the defaults of `Limits` if None.
         name: Name of the sequence; the sanitised stem if None.
         budget_s: Wall seconds after which the child is killed.
@@ -86,5 +82,6 @@ def probe(
         stall_s=budget_s,
     )
     with DecoderProcess(request, path.name, stall_s=budget_s, wall_s=budget_s) as child:
-        info = child.document()["info"]
-    return VideoInfo(name=name or sanitise_name(path.stem), path=str(path), size_bytes=size_bytes, **info)
+        document = child.document()
+    report_protections(document)
+    return VideoInfo(name=name or sanitise_name(path.stem), path=str(path), size_bytes=size_bytes, **document["info"])

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import fcntl
 import json
+import logging
 import os
 import selectors
 import signal
@@ -20,6 +21,7 @@ import numpy as np
 
 from vipe_core.errors import DecodeCrashed, DecodeError, DecodeTimeout
 from vipe_core.video.limits import Limits
+from vipe_core.video.sandbox import PROTECTIONS
 from vipe_core.video.source import Frame
 from vipe_core.video.wire import (
     DOCUMENT,
@@ -35,6 +37,12 @@ _PACKAGE_ROOT = Path(__file__).resolve().parents[2]
 _PIPE_BYTES = 1 << 20
 # A busy machine takes its time to start an interpreter; that says nothing about the video.
 _START_S = 60.0
+# What a child may know of this process's environment: how to start, and nothing that could be a secret.
+_ENVIRONMENT = ("PATH", "HOME", "LANG", "TZ", "TMPDIR", "VIRTUAL_ENV", "LD_LIBRARY_PATH", "LD_PRELOAD", "SYSTEMROOT")
+_ENVIRONMENT_PREFIXES = ("PYTHON", "LC_", "DYLD_", "COVERAGE")
+
+_log = logging.getLogger(__name__)
+_reported: set[tuple[str, ...]] = set()
 
 
 class DecoderProcess:
@@ -194,8 +202,22 @@ class DecoderProcess:
         return DecodeCrashed(f"{self._label}: the decoder process {how}{reason}; try again or re-encode the video")
 
 
+def report_protections(document: dict[str, Any]) -> None:
+    """Log, once, which protections of `vipe_core.video.sandbox` are active in the children."""
+    active = tuple(document["protections"])
+    if active not in _reported:
+        _reported.add(active)
+        missing = [name for name in PROTECTIONS if name not in active]
+        absent = f"; not available here: {', '.join(missing)}" if missing else ""
+        _log.info("decoder processes are protected by: %s%s", ", ".join(active), absent)
+
+
 def _child_environment(limits: Limits) -> dict[str, str]:
-    environment = dict(os.environ)
+    environment = {
+        name: value
+        for name, value in os.environ.items()
+        if name in _ENVIRONMENT or name.startswith(_ENVIRONMENT_PREFIXES)
+    }
     inherited = environment.get("PYTHONPATH")
     environment["PYTHONPATH"] = f"{_PACKAGE_ROOT}{os.pathsep}{inherited}" if inherited else str(_PACKAGE_ROOT)
     # The child does no linear algebra: thread pools would only slow its start.
