@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import Literal
+from typing import Literal, Self
 
-from pydantic import Field, SecretStr, field_validator
+from pydantic import Field, SecretStr, field_validator, model_validator
 from pydantic_settings import BaseSettings, SettingsConfigDict
 
 
@@ -30,16 +30,50 @@ class Settings(BaseSettings):
     """Node-local folder for inputs, artifacts and tars in the making; default: `scratch` in `data_dir`."""
 
     host: str = "127.0.0.1"
-    """Address that the API listens on. Anything but loopback needs `api_key`, or `allow_anonymous`."""
+    """Address that the API listens on. On anything but loopback every request needs a key (see `allow_anonymous`)."""
 
     port: int = Field(default=8080, ge=0, le=65535)
     """Port that the API listens on; 0 takes a free one."""
 
     api_key: SecretStr | None = None
-    """When set, every `/v1` request must carry `Authorization: Bearer <api_key>`."""
+    """The first administrator's key, of the tenant `default` and with all scopes; others are made with it, or with
+    `vipectl keys create`. When set, every `/v1` request needs a key, this one or another."""
 
-    allow_anonymous: bool = False
-    """Serve without an `api_key` where `host` is not loopback; something else must then keep strangers out."""
+    allow_anonymous: bool | None = None
+    """Whether requests without a key act for the tenant `default` with all scopes, where no `api_key` is set. Default:
+    where `host` is loopback. If true elsewhere, something else must keep strangers out."""
+
+    allowed_hosts: tuple[str, ...] = ()
+    """Names under which the API answers, `*.example.org` for all below one; empty: all, but only localhost where no
+    key is needed on loopback. As JSON list."""
+
+    cors_origins: tuple[str, ...] = ()
+    """Web pages of these origins (`https://example.org`) may use the API from a browser; empty: of none. As JSON
+    list."""
+
+    trusted_proxies: tuple[str, ...] = ()
+    """Addresses or networks of proxies whose `X-Forwarded-For` and `X-Forwarded-Proto` are believed. As JSON list."""
+
+    tls_cert_file: Path | None = None
+    """Certificate chain (PEM); with it and `tls_key_file` the API speaks HTTPS only."""
+
+    tls_key_file: Path | None = None
+    """Private key (PEM) of `tls_cert_file`."""
+
+    rate_limit_per_s: float = Field(default=100.0, gt=0)
+    """Requests per second of one key, or of one address where no key is needed; more are answered with 429."""
+
+    rate_limit_burst: int = Field(default=500, ge=1)
+    """Requests that one key may send at once."""
+
+    max_streams_per_key: int = Field(default=100, ge=1)
+    """Event streams that one key, or one address where no key is needed, may have open."""
+
+    max_connections: int = Field(default=2000, ge=1)
+    """Connections that the API holds open; further ones are answered with 503."""
+
+    receive_timeout_s: float = Field(default=30.0, gt=0)
+    """A request whose headers and body have not arrived by then is given up."""
 
     max_body_bytes: int = Field(default=1 << 20, ge=1024)
     """Largest request body that the API reads."""
@@ -88,6 +122,12 @@ class Settings(BaseSettings):
 
     log_format: Literal["text", "json"] = "text"
     """`json` for a log collector: one object a line."""
+
+    @model_validator(mode="after")
+    def _whole_pair(self) -> Self:
+        if (self.tls_cert_file is None) != (self.tls_key_file is None):
+            raise ValueError("tls_cert_file and tls_key_file go together")
+        return self
 
     @field_validator("data_dir", "scratch_dir")
     @classmethod

@@ -8,15 +8,29 @@ from typing import Any
 
 from fastapi import APIRouter, FastAPI, Request, Response
 from fastapi.openapi.utils import get_openapi
+from starlette.middleware.cors import CORSMiddleware
 
-from services.api import problems, routes
-from services.api.middleware import BodyLimit, LoopbackHost, RequestContext, is_loopback
+from services.api import access_routes, problems, routes
+from services.api.audit import AuditTrail
+from services.api.authentication import Authenticator, serves_anonymous
+from services.api.guard import Guard
+from services.api.hosts import KnownHosts, OwnOrigins, is_loopback
+from services.api.idempotency import KeysInWork
+from services.api.limits import StreamLimit
+from services.api.middleware import BodyLimit, RequestContext
 from services.api.problems import Problem
 from services.api.schemas import Readiness, Status
 from services.domain.errors import StoreUnavailable
 from services.observability.metrics import CONTENT_TYPE, Metrics, package_version
 from services.settings import Settings
 from services.store.base import Store
+
+# No cookies: who may use the API has a key to send.
+_CORS: dict[str, Any] = {
+    "allow_methods": ["GET", "POST", "PUT", "PATCH", "DELETE"],
+    "allow_headers": ["Authorization", "Content-Type", "Idempotency-Key", "If-Match", "Last-Event-ID", "X-Request-ID"],
+    "expose_headers": ["ETag", "Idempotent-Replayed", "Location", "Retry-After", "X-Request-ID"],
+}
 
 
 def create_app(
@@ -29,7 +43,7 @@ def create_app(
 
     Args:
         store: Where the jobs are.
-        settings: `host`, `api_key` and `max_body_bytes` are used here.
+        settings: What concerns access, names and limits is used here.
         metrics: What `/metrics` shows; share it with an agent in the same process. Default: one of its own.
         agent_ready: Whether the agent in the same process can work, shown by `/readyz`; None where there is no agent.
     """
@@ -45,13 +59,30 @@ def create_app(
     app.state.metrics = metrics
     app.state.agent_ready = agent_ready
     app.state.draining = threading.Event()
+    app.state.authenticator = Authenticator(store, settings)
+    app.state.trail = AuditTrail(store)
+    app.state.streams = StreamLimit(settings.max_streams_per_key)
+    app.state.keys_in_work = KeysInWork()
 
     problems.install(app)
-    app.add_middleware(BodyLimit, max_bytes=settings.max_body_bytes)
-    if settings.api_key is None and is_loopback(settings.host):
-        app.add_middleware(LoopbackHost)
+    # The last that is added is the first that sees a request.
+    app.add_middleware(BodyLimit, max_bytes=settings.max_body_bytes, timeout_s=settings.receive_timeout_s)
+    app.add_middleware(
+        Guard,
+        authenticator=app.state.authenticator,
+        trail=app.state.trail,
+        rate_per_s=settings.rate_limit_per_s,
+        burst=settings.rate_limit_burst,
+    )
+    app.add_middleware(OwnOrigins, allowed=settings.cors_origins)
+    if settings.cors_origins:
+        app.add_middleware(CORSMiddleware, **_CORS, allow_origins=settings.cors_origins)
+    open_on_loopback = serves_anonymous(settings) and is_loopback(settings.host)
+    if open_on_loopback or settings.allowed_hosts:
+        app.add_middleware(KnownHosts, names=settings.allowed_hosts, loopback=open_on_loopback)
     app.add_middleware(RequestContext, metrics=metrics)
     app.include_router(routes.router)
+    app.include_router(access_routes.router)
     app.include_router(_operations)
     _document_problems(app)
     return app

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import ipaddress
 import logging
 import re
 import time
 import uuid
 
+import anyio
 from starlette.datastructures import Headers, MutableHeaders
 from starlette.exceptions import HTTPException
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
@@ -21,37 +21,29 @@ _ID_HEADER = "X-Request-ID"
 _ACCEPTABLE_ID = re.compile(r"[A-Za-z0-9._:-]{1,128}")
 
 
-def is_loopback(host: str) -> bool:
-    """Whether a name or address (IPv6 without brackets) can only be this machine."""
-    try:
-        return ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return host.lower() == "localhost"
+_NO_FURTHER = "default-src 'none'; frame-ancestors 'none'"
+# The page loads its program from there; it has no use for anything else.
+_DOCS = (
+    "default-src 'none'; connect-src 'self'; frame-ancestors 'none'; img-src https://fastapi.tiangolo.com data:; "
+    "script-src https://cdn.jsdelivr.net 'unsafe-inline'; style-src https://cdn.jsdelivr.net 'unsafe-inline'"
+)
+_EVERYWHERE = {
+    "X-Content-Type-Options": "nosniff",
+    "X-Frame-Options": "DENY",
+    "Referrer-Policy": "no-referrer",
+    "Cross-Origin-Opener-Policy": "same-origin",
+    "Permissions-Policy": "camera=(), geolocation=(), microphone=()",
+}
 
 
-class LoopbackHost:
-    """Refuses requests to a loopback service under a name that is not this machine's.
-
-    A web page can point its own name at 127.0.0.1 (DNS rebinding) and then read every answer as its own; what it cannot
-    change is the name that the browser sends.
-    """
-
-    def __init__(self, app: ASGIApp) -> None:
-        self._app = app
-
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        if scope["type"] == "http" and not is_loopback(_host_name(Headers(scope=scope).get("host", ""))):
-            detail = "this service answers to localhost only; to serve under a name, set VIPE_API_KEY"
-            await problems.response(scope, 400, "unknown_host", detail)(scope, receive, send)
-            return
-        await self._app(scope, receive, send)
-
-
-def _host_name(header: str) -> str:
-    """The name or address in a Host header, without port and brackets."""
-    if header.startswith("["):
-        return header[1:].partition("]")[0]
-    return header.partition(":")[0]
+def _secure(headers: MutableHeaders, scope: Scope) -> None:
+    """What tells browsers and caches to make nothing of an answer but what it is."""
+    for name, value in _EVERYWHERE.items():
+        headers[name] = value
+    headers["Content-Security-Policy"] = _DOCS if scope["path"] == "/docs" else _NO_FURTHER
+    headers.setdefault("Cache-Control", "no-store")
+    if scope.get("scheme") == "https":
+        headers["Strict-Transport-Security"] = "max-age=31536000"
 
 
 class RequestContext:
@@ -80,6 +72,7 @@ class RequestContext:
                 status = message["status"]
                 headers = MutableHeaders(scope=message)
                 headers[_ID_HEADER] = request_id
+                _secure(headers, scope)
                 if headers.get("content-type", "").startswith("text/event-stream"):
                     answered_s = time.perf_counter() - start
             await send(message)
@@ -112,11 +105,15 @@ _PATIENCE = 16
 
 
 class BodyLimit:
-    """Refuses a body that is larger than allowed, whatever its headers promise; never holds more than that."""
+    """Refuses a body that is larger than allowed, whatever its headers promise, or that does not arrive in time.
 
-    def __init__(self, app: ASGIApp, *, max_bytes: int) -> None:
+    Never holds more than is allowed.
+    """
+
+    def __init__(self, app: ASGIApp, *, max_bytes: int, timeout_s: float) -> None:
         self._app = app
         self._max_bytes = max_bytes
+        self._timeout_s = timeout_s
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] != "http":
@@ -129,10 +126,20 @@ class BodyLimit:
             await problems.response(scope, 413, "body_too_large", detail)(scope, receive, send)
             return
         read_bytes = 0
+        complete = False
+        deadline_s = anyio.current_time() + self._timeout_s
 
         async def counted() -> Message:
-            nonlocal read_bytes
-            message = await receive()
+            nonlocal read_bytes, complete
+            if complete:  # what comes now is the end of the connection, for which a stream waits as long as it lasts
+                return await receive()
+            try:
+                with anyio.fail_after(deadline_s - anyio.current_time()):
+                    message = await receive()
+            except TimeoutError:
+                late = f"the request body did not arrive within {self._timeout_s:g} s"
+                raise HTTPException(408, late, {"Connection": "close"}) from None
+            complete = not message.get("more_body", False)
             read_bytes += len(message.get("body", b""))
             if read_bytes > self._max_bytes:
                 if message.get("more_body", False):
@@ -144,8 +151,9 @@ class BodyLimit:
 
     async def _discard(self, receive: Receive) -> None:
         dropped_bytes = 0
-        while dropped_bytes <= _PATIENCE * self._max_bytes:
-            message = await receive()
-            dropped_bytes += len(message.get("body", b""))
-            if not message.get("more_body", False):
-                return
+        with anyio.move_on_after(self._timeout_s):
+            while dropped_bytes <= _PATIENCE * self._max_bytes:
+                message = await receive()
+                dropped_bytes += len(message.get("body", b""))
+                if not message.get("more_body", False):
+                    return

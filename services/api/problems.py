@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 from http import HTTPStatus
 from typing import Any, ClassVar
 
@@ -17,7 +18,13 @@ from services.domain.errors import ServiceError
 
 MEDIA_TYPE = "application/problem+json"
 _MAX_FIELD_ERRORS = 50
-_FRAMEWORK_CODES = {400: "bad_request", 404: "not_found", 405: "method_not_allowed", 413: "body_too_large"}
+_FRAMEWORK_CODES = {
+    400: "bad_request",
+    404: "not_found",
+    405: "method_not_allowed",
+    408: "body_too_slow",
+    413: "body_too_large",
+}
 _log = logging.getLogger(__name__)
 
 
@@ -33,6 +40,26 @@ class Forbidden(ServiceError):
 
     code = "forbidden"
     status = 403
+
+
+class RateLimited(ServiceError):
+    """The caller asks more often than it may."""
+
+    code = "rate_limited"
+    status = 429
+    retryable = True
+
+    def __init__(self, message: str, *, retry_after_s: float) -> None:
+        super().__init__(message)
+        self.retry_after_s = retry_after_s
+
+
+class TooManyStreams(ServiceError):
+    """The caller follows as many jobs at the same time as it may."""
+
+    code = "too_many_streams"
+    status = 429
+    retryable = True
 
 
 class UnsupportedMediaType(ServiceError):
@@ -71,6 +98,7 @@ def response(
     headers: dict[str, str] | None = None,
 ) -> JSONResponse:
     """A problem about the request in `scope`."""
+    scope.setdefault("state", {})["problem_code"] = code
     problem = Problem(
         type=f"urn:vipe:problem:{code}",
         title=code.replace("_", " ").capitalize(),
@@ -82,6 +110,16 @@ def response(
         errors=errors or [],
     )
     return JSONResponse(problem.model_dump(), status_code=status, media_type=MEDIA_TYPE, headers=headers)
+
+
+def of(scope: Scope, error: ServiceError) -> JSONResponse:
+    """The problem that an error of the service is."""
+    headers = {}
+    if error.status == 401:
+        headers["WWW-Authenticate"] = "Bearer"
+    if error.retryable:
+        headers["Retry-After"] = str(max(1, math.ceil(error.retry_after_s)))
+    return response(scope, error.status, error.code, str(error), headers=headers)
 
 
 def responses(*statuses: int) -> dict[int | str, dict[str, Any]]:
@@ -100,12 +138,7 @@ def install(app: FastAPI) -> None:
     def on_service_error(request: Request, error: ServiceError) -> JSONResponse:
         if error.status >= 500:
             _log.error("%s %s: %s", request.method, request.url.path, error)
-        headers = {}
-        if error.status == 401:
-            headers["WWW-Authenticate"] = "Bearer"
-        if error.retryable:
-            headers["Retry-After"] = "5"
-        return response(request.scope, error.status, error.code, str(error), headers=headers)
+        return of(request.scope, error)
 
     @app.exception_handler(RequestValidationError)
     def on_invalid_request(request: Request, error: RequestValidationError) -> JSONResponse:

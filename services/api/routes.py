@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path as FilePath
 from typing import Annotated
 
@@ -11,6 +12,8 @@ from pydantic import AfterValidator
 from services.api import paging
 from services.api.authentication import Reader, Writer
 from services.api.events import LAST_EVENT_ID, event_page, event_stream, wants_stream
+from services.api.idempotency import IdempotencyKey, KeysInWork, RequestHash
+from services.api.limits import address_of
 from services.api.problems import UnsupportedMediaType, responses
 from services.api.schemas import (
     EventPage,
@@ -71,7 +74,7 @@ router = APIRouter(prefix="/v1/jobs", tags=["jobs"])
                 },
             },
         },
-        **responses(400, 401, 403, 409, 413, 415, 422, 503),
+        **responses(400, 401, 403, 408, 409, 413, 415, 422, 429, 503),
     },
 )
 def create_job(
@@ -80,15 +83,17 @@ def create_job(
     store: TheStore,
     request: Request,
     response: Response,
-    idempotency_key: Annotated[
-        str | None,
-        Header(min_length=1, max_length=255, pattern=r"^[\x21-\x7e]+$", description="The same key creates one job."),
-    ] = None,
+    request_hash: RequestHash,
+    idempotency_key: IdempotencyKey = None,
 ) -> JobView:
-    """Create a job. Sent again with the same `Idempotency-Key` and body, it answers with the job of the first time."""
+    """Create a job. Sent again within 7 days with the same `Idempotency-Key` and body, it gets its first answer."""
     spec = body.to_spec()
     _check_output(spec.output, request.app.state.settings.output_roots)
-    job, created = store.create_job(spec, tenant=caller.tenant, idempotency_key=idempotency_key)
+    working: KeysInWork = request.app.state.keys_in_work
+    with working.on(caller.tenant, idempotency_key):
+        job, created = store.create_job(
+            spec, tenant=caller.tenant, idempotency_key=idempotency_key, request_hash=request_hash
+        )
     response.headers["Location"] = f"/v1/jobs/{job.id}"
     if not created:
         response.headers["Idempotent-Replayed"] = "true"
@@ -105,7 +110,7 @@ def _check_output(output: str, roots: tuple[FilePath, ...]) -> None:
         raise InvalidRequest(f"output {output} lies outside of the directories that this service may write")
 
 
-@router.get("", responses=responses(400, 401, 403, 422, 503))
+@router.get("", responses=responses(400, 401, 403, 422, 429, 503))
 def list_jobs(
     caller: Reader, store: TheStore, limit: Limit = 50, page_token: PageToken = None, state: JobState | None = None
 ) -> JobPage:
@@ -115,19 +120,19 @@ def list_jobs(
     return JobPage(items=[JobView.of(job) for job in jobs], next_page_token=paging.token(after, of="jobs"))
 
 
-@router.get("/{job_id}", responses=responses(401, 403, 404, 422, 503))
+@router.get("/{job_id}", responses=responses(401, 403, 404, 422, 429, 503))
 def get_job(job_id: JobId, caller: Reader, store: TheStore) -> JobView:
     """Show a job and its progress."""
     return JobView.of(store.get_job(job_id, tenant=caller.tenant))
 
 
-@router.post("/{job_id}/cancel", status_code=202, responses=responses(401, 403, 404, 409, 422, 503))
+@router.post("/{job_id}/cancel", status_code=202, responses=responses(401, 403, 404, 409, 422, 429, 503))
 def cancel_job(job_id: JobId, caller: Writer, store: TheStore) -> JobView:
     """Cancel a job. What is committed stays; work under way is stopped, and the job is cancelled when it has."""
     return JobView.of(store.request_cancel(job_id, tenant=caller.tenant))
 
 
-@router.get("/{job_id}/videos", responses=responses(400, 401, 403, 404, 422, 503))
+@router.get("/{job_id}/videos", responses=responses(400, 401, 403, 404, 422, 429, 503))
 def list_videos(
     job_id: JobId,
     caller: Reader,
@@ -146,7 +151,7 @@ def list_videos(
     return VideoPage(items=[VideoView.of(row) for row in rows], next_page_token=paging.token(after, of=name))
 
 
-@router.get("/{job_id}/shards", responses=responses(400, 401, 403, 404, 422, 503))
+@router.get("/{job_id}/shards", responses=responses(400, 401, 403, 404, 422, 429, 503))
 def list_shards(
     job_id: JobId, caller: Reader, store: TheStore, limit: Limit = 100, page_token: PageToken = None
 ) -> ShardPage:
@@ -168,7 +173,7 @@ def list_shards(
         204: {
             "description": "The job has ended, and `Last-Event-ID` names its last event: there is nothing to follow."
         },
-        **responses(400, 401, 403, 404, 422, 503),
+        **responses(400, 401, 403, 404, 422, 429, 503),
     },
 )
 def list_events(
@@ -189,6 +194,15 @@ def list_events(
     that has ended. Reconnect with `Last-Event-ID` to miss nothing.
     """
     if wants_stream(request.headers.get("accept", "")):
-        draining = request.app.state.draining
-        return event_stream(store, job_id, tenant=caller.tenant, after_seq=int(last_event_id or 0), draining=draining)
+        state = request.app.state
+        return event_stream(
+            store,
+            job_id,
+            tenant=caller.tenant,
+            after_seq=int(last_event_id or 0),
+            draining=state.draining,
+            reader=caller.key_id or address_of(request.scope),
+            limit=state.streams,
+            welcome=partial(state.authenticator.holds, caller),
+        )
     return event_page(store, job_id, tenant=caller.tenant, limit=limit, page_token=page_token)

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import socket
+import ssl
 
 import uvicorn
 from fastapi import FastAPI
 
-from services.api.middleware import is_loopback
+from services.api.authentication import serves_anonymous
+from services.api.connections import ServerConfig
 from services.domain.errors import InvalidRequest
 from services.settings import Settings
+from services.store.base import Store
 
 _DRAIN_S = 10
 
@@ -25,22 +28,25 @@ class ApiServer(uvicorn.Server):
     def url(self) -> str:
         """Where it listens, once `started` is true; tells the port that was taken for port 0."""
         host, port = self.servers[0].sockets[0].getsockname()[:2]
-        return f"http://[{host}]:{port}" if ":" in host else f"http://{host}:{port}"
+        scheme = "https" if self.config.is_ssl else "http"
+        return f"{scheme}://[{host}]:{port}" if ":" in host else f"{scheme}://{host}:{port}"
 
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
         self._app.state.draining.set()
         await super().shutdown(sockets)
+        self._app.state.trail.close()
 
 
 def create_server(app: FastAPI, settings: Settings) -> ApiServer:
     """A server for `create_app`'s application at the address of the settings. Logging stays as it is configured.
 
     Raises:
-        InvalidRequest: Whoever reaches the address could use it: no key, not loopback, and nobody said that it may be.
+        InvalidRequest: Nobody could use it, see `check_exposure`; or the certificate cannot be read.
     """
-    check_exposure(settings)
-    config = uvicorn.Config(
+    check_exposure(settings, app.state.store)
+    config = ServerConfig(
         app,
+        receive_timeout_s=settings.receive_timeout_s,
         host=settings.host,
         port=settings.port,
         log_config=None,
@@ -48,14 +54,30 @@ def create_server(app: FastAPI, settings: Settings) -> ApiServer:
         server_header=False,
         lifespan="off",
         timeout_graceful_shutdown=_DRAIN_S,
+        limit_concurrency=settings.max_connections,
+        proxy_headers=bool(settings.trusted_proxies),
+        forwarded_allow_ips=list(settings.trusted_proxies),
+        ssl_certfile=settings.tls_cert_file,
+        ssl_keyfile=settings.tls_key_file,
     )
+    try:
+        config.load()
+    except (OSError, ssl.SSLError) as error:
+        raise InvalidRequest(
+            f"VIPE_TLS_CERT_FILE {settings.tls_cert_file} and VIPE_TLS_KEY_FILE {settings.tls_key_file}"
+            f" cannot be used: {error}"
+        ) from error
     return ApiServer(app, config)
 
 
-def check_exposure(settings: Settings) -> None:
-    """Raises InvalidRequest where `create_server` would; for a program that starts other things first."""
-    if settings.api_key is None and not settings.allow_anonymous and not is_loopback(settings.host):
+def check_exposure(settings: Settings, store: Store) -> None:
+    """For a program that starts other things before its server.
+
+    Raises:
+        InvalidRequest: The API would wait on an address for keys that nobody has.
+    """
+    if settings.api_key is None and not serves_anonymous(settings) and not store.list_keys(limit=1)[0]:
         raise InvalidRequest(
-            f"the API would answer everybody who reaches {settings.host}: set VIPE_API_KEY,"
+            f"nobody could use the API on {settings.host}: create a key with `vipectl keys create`, set VIPE_API_KEY,"
             " or VIPE_ALLOW_ANONYMOUS=true where something else keeps strangers out"
         )

@@ -9,7 +9,7 @@ from typing import Annotated, ParamSpec, TypeVar
 
 import typer
 
-from services.cli import annotate, data, demo, evaluate, export, gallery, jobs, serve
+from services.cli import annotate, data, demo, evaluate, export, gallery, jobs, keys, serve
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -81,6 +81,16 @@ _COMMANDS: dict[str, Callable[..., None]] = {
 }
 for _name, _command in _COMMANDS.items():
     app.command(_name)(_typed_errors(_command))
+
+_keys = typer.Typer(help="API keys: create, list, revoke.", no_args_is_help=True, rich_markup_mode=None)
+_KEY_COMMANDS: dict[str, Callable[..., None]] = {
+    "create": keys.create,
+    "list": keys.list_keys,
+    "revoke": keys.revoke,
+}
+for _name, _command in _KEY_COMMANDS.items():
+    _keys.command(_name)(_typed_errors(_command))
+app.add_typer(_keys, name="keys")
 
 if __name__ == "__main__":
     sys.exit(app())

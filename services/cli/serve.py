@@ -9,9 +9,11 @@ import signal
 import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
+
+from services.cli.settings import Database, settings_from
 
 if TYPE_CHECKING:
     from services.agent.agent import Agent
@@ -29,7 +31,8 @@ Port = Annotated[int | None, typer.Option(help="Port of the API; 0 takes a free 
 DataDir = Annotated[Path | None, typer.Option(help="Folder of the database and scratch files.")]
 Slots = Annotated[int | None, typer.Option(help="Worker processes; one video in each.")]
 Device = Annotated[str | None, typer.Option(help="cpu or cuda.")]
-Database = Annotated[str | None, typer.Option("--database-url", help="sqlite:///... or postgresql+psycopg://...")]
+TlsCert = Annotated[Path | None, typer.Option(help="Certificate chain (PEM): speak HTTPS only.")]
+TlsKey = Annotated[Path | None, typer.Option(help="Private key of the certificate (PEM).")]
 
 
 def up(
@@ -39,6 +42,8 @@ def up(
     slots: Slots = None,
     device: Device = None,
     database_url: Database = None,
+    tls_cert: TlsCert = None,
+    tls_key: TlsKey = None,
 ) -> None:
     """Run the whole service here: API, SQLite, a local Ray.
 
@@ -46,21 +51,36 @@ def up(
     """
     from services.api.server import check_exposure
 
-    settings = _settings(
-        host=host, port=port, data_dir=data_dir, num_slots=slots, device=device, database_url=database_url
+    settings = settings_from(
+        host=host,
+        port=port,
+        data_dir=data_dir,
+        num_slots=slots,
+        device=device,
+        database_url=database_url,
+        tls_cert_file=tls_cert,
+        tls_key_file=tls_key,
     )
     if "lease_ttl_s" not in settings.model_fields_set:
         settings = settings.model_copy(update={"lease_ttl_s": _EMBEDDED_LEASE_TTL_S})
-    check_exposure(settings)  # before Ray and the workers start
     with _open_store(settings) as store:
+        check_exposure(settings, store)  # before Ray and the workers start
         metrics = _metrics()
         with _running_agent(store, settings, metrics) as running:
             _serve_api(store, settings, metrics, lambda: running.ready)
 
 
-def api(host: Host = None, port: Port = None, database_url: Database = None) -> None:
+def api(
+    host: Host = None,
+    port: Port = None,
+    database_url: Database = None,
+    tls_cert: TlsCert = None,
+    tls_key: TlsKey = None,
+) -> None:
     """Run the API alone; agents share its database."""
-    settings = _settings(host=host, port=port, database_url=database_url)
+    settings = settings_from(
+        host=host, port=port, database_url=database_url, tls_cert_file=tls_cert, tls_key_file=tls_key
+    )
     with _open_store(settings) as store:
         _serve_api(store, settings, _metrics())
 
@@ -76,7 +96,7 @@ def agent(
 
     It leases shards from the database and runs them on Ray: the cluster of VIPE_RAY_ADDRESS, or a private one.
     """
-    settings = _settings(num_slots=slots, device=device, database_url=database_url)
+    settings = settings_from(num_slots=slots, device=device, database_url=database_url)
     metrics = _metrics()
     stop = threading.Event()
     for number in (signal.SIGTERM, signal.SIGINT):
@@ -85,23 +105,6 @@ def agent(
         server, _ = metrics.serve(metrics_port, metrics_host)
         logger.info("metrics on http://%s:%d/metrics", metrics_host, server.server_port)
         stop.wait()
-
-
-def _settings(**overrides: Any) -> Settings:
-    """Settings from the environment (`VIPE_*`), overridden by what the command line names."""
-    from pydantic import ValidationError
-
-    from services.observability.logging import configure_logging
-    from services.settings import Settings
-
-    try:
-        settings = Settings(**{name: value for name, value in overrides.items() if value is not None})
-    except ValidationError as error:
-        first = error.errors()[0]
-        name = ".".join(map(str, first["loc"]))
-        raise typer.BadParameter(f"{name} (VIPE_{name.upper()}): {first['msg']}") from None
-    configure_logging(settings.log_level, settings.log_format)
-    return settings
 
 
 def _metrics() -> Metrics:
@@ -146,5 +149,6 @@ def _serve_api(
     # uvicorn raises the signal again once it has stopped; the process must live on to stop the agent.
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: None)
-    logger.info("API on http://%s:%d, process %d", settings.host, settings.port, os.getpid())
+    scheme = "https" if settings.tls_cert_file else "http"
+    logger.info("API on %s://%s:%d, process %d", scheme, settings.host, settings.port, os.getpid())
     server.run()

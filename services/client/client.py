@@ -12,7 +12,7 @@ from typing import Any
 import httpx
 
 from services.client.sse import parse_events
-from services.domain.errors import JobNotCancellable
+from services.domain.errors import IdempotencyInFlight, JobNotCancellable
 from services.domain.events import ends_history
 from services.domain.models import JobSpec
 from services.domain.states import JobState
@@ -21,6 +21,7 @@ Json = dict[str, Any]
 _RECONNECT_S = 1.0
 _RECONNECT_FOR_S = 120.0
 _RETRIES = 4
+_MAX_WAIT_S = 30.0
 _UNREACHABLE = "unreachable"
 
 
@@ -196,19 +197,35 @@ class Client:
     def _call(self, method: str, path: str, **request: Any) -> Json:
         """Every call of this client may be repeated, so a connection that breaks is tried again."""
         for attempt in range(_RETRIES + 1):
+            wait_s = 0.2 * 2**attempt
             try:
                 response = self._http.request(method, path, **request)
             except httpx.TransportError as error:
                 if attempt == _RETRIES:
                     raise _unreachable(self._http, error) from error
             else:
-                if response.status_code != 503 or attempt == _RETRIES:
+                if attempt == _RETRIES or not _may_be_repeated(response):
                     break
-            time.sleep(0.2 * 2**attempt)
+                wait_s = max(wait_s, min(_retry_after_s(response), _MAX_WAIT_S))
+            time.sleep(wait_s)
         if not response.is_success:
             raise _api_error(response)
         answer: Json = response.json()
         return answer
+
+
+def _may_be_repeated(response: httpx.Response) -> bool:
+    """Whether the service was busy: without its store, with too many requests, or with the same one still."""
+    if response.status_code == 409:
+        return _api_error(response).code == IdempotencyInFlight.code
+    return response.status_code in (429, 503)
+
+
+def _retry_after_s(response: httpx.Response) -> float:
+    if response.status_code == 503:
+        return 0.0  # the store may be back sooner than the service can know
+    given = response.headers.get("retry-after", "")
+    return float(given) if given.isascii() and given.isdigit() else 0.0
 
 
 def _api_error(response: httpx.Response) -> ApiError:

@@ -15,6 +15,8 @@ class ServiceError(Exception):
     code: ClassVar[str] = "service_error"
     status: ClassVar[int] = 500
     retryable: ClassVar[bool] = False
+    retry_after_s: float = 5.0
+    """When trying again makes sense, where it does at all."""
 
 
 class InvalidRequest(ServiceError):
@@ -69,6 +71,7 @@ class IdempotencyInFlight(ServiceError):
     code = "idempotency_in_flight"
     status = 409
     retryable = True
+    retry_after_s = 1.0
 
 
 class KeyNotFound(ServiceError):

@@ -37,6 +37,8 @@ _SECRETS = (
         r"\g<keep>***",
     ),
     (re.compile(r"(?P<keep>bearer\s+)[a-z0-9._~+/=-]{8,}", re.IGNORECASE), r"\g<keep>***"),
+    # our own keys, of which the id may be told
+    (re.compile(r"(?P<keep>vipe_[a-z2-7]{12}_)[a-z2-7]+"), r"\g<keep>***"),
     # access key ids
     (re.compile(r"\b(?:AKIA|ASIA)[A-Z0-9]{16}\b"), "***"),
 )

@@ -239,6 +239,9 @@ class Store(Protocol):
     ) -> tuple[ApiKey, str]:
         """A new key, without its secret and as the text that its owner uses; the text is not kept."""
 
+    def get_key(self, key_id: str, *, tenant: str | None = None) -> ApiKey:
+        """A key without its secret. Raises KeyNotFound."""
+
     def find_key(self, key_id: str) -> tuple[ApiKey, str, bool] | None:
         """A key, the hash to hold it against, and whether it is neither revoked nor expired; None if unknown."""
 

@@ -191,7 +191,10 @@ class SqlStore:
         key_id, key = new_key()
         key_hash = hash_key(key)
         self._db.write(lambda tx: keys.create(tx, key_id, key_hash, tenant, name, scopes, expires_in_s))
-        return self._db.read(lambda tx: keys.get(tx, key_id)), key
+        return self.get_key(key_id), key
+
+    def get_key(self, key_id: str, *, tenant: str | None = None) -> ApiKey:
+        return self._db.read(lambda tx: keys.get(tx, key_id, tenant))
 
     def find_key(self, key_id: str) -> tuple[ApiKey, str, bool] | None:
         return self._db.read(lambda tx: keys.find(tx, key_id))
@@ -203,7 +206,7 @@ class SqlStore:
 
     def revoke_key(self, key_id: str, *, tenant: str | None = None) -> ApiKey:
         self._db.write(lambda tx: keys.revoke(tx, key_id, tenant))
-        return self._db.read(lambda tx: keys.get(tx, key_id, tenant))
+        return self.get_key(key_id, tenant=tenant)
 
     def touch_key(self, key_id: str) -> None:
         self._db.write(lambda tx: keys.touch(tx, key_id))

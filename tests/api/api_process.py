@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 import threading
 
@@ -11,8 +12,9 @@ from services.store.sql import SqlStore
 
 
 def main() -> None:
-    given = dict(arg.split("=", 1) for arg in sys.argv[2:])
-    settings = Settings.model_validate({"database_url": sys.argv[1], "port": 0, **given})
+    os.environ["VIPE_PORT"] = "0"
+    os.environ.update({f"VIPE_{name.upper()}": value for name, value in (arg.split("=", 1) for arg in sys.argv[2:])})
+    settings = Settings(database_url=sys.argv[1])
     store = SqlStore(settings.database_url)
     server = create_server(create_app(store, settings), settings)
 

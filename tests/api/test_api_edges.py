@@ -104,6 +104,8 @@ def test_a_public_address_needs_a_key(tmp_path: Path) -> None:
         public = Settings(host=host, port=0)
         with pytest.raises(errors.InvalidRequest, match=f"{host}.*VIPE_API_KEY.*VIPE_ALLOW_ANONYMOUS"):
             create_server(create_app(store, public), public)
+    with pytest.raises(errors.InvalidRequest, match="vipectl keys create"):
+        create_server(create_app(store, strict := Settings(allow_anonymous=False)), strict)
     for allowed in (
         Settings(host="0.0.0.0", api_key=SecretStr("secret")),
         Settings(host="0.0.0.0", allow_anonymous=True),
@@ -111,6 +113,8 @@ def test_a_public_address_needs_a_key(tmp_path: Path) -> None:
         Settings(host="localhost"),
     ):
         create_server(create_app(store, allowed), allowed)
+    store.create_key("somebody")
+    create_server(create_app(store, public), public)
     store.close()
 
 

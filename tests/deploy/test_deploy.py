@@ -24,6 +24,7 @@ from services.cli.main import app
 from services.domain.errors import InvalidRequest
 from services.observability.metrics import Metrics
 from services.settings import Settings
+from services.store.sql import SqlStore
 
 ROOT = Path(__file__).resolve().parents[2]
 DEPLOY = ROOT / "deploy"
@@ -168,10 +169,12 @@ def test_container_commands_exist_in_the_program() -> None:
             pass  # click parsed every option
 
 
-def test_every_api_that_listens_beyond_its_container_has_a_key() -> None:
+def test_every_api_that_listens_beyond_its_container_has_a_key(tmp_path: Path) -> None:
     assert ["vipectl", "api", "--host", "0.0.0.0", "--port", "8080"] in shell_commands()
+    store = SqlStore(f"sqlite:///{tmp_path}/store.db")
     with pytest.raises(InvalidRequest):
-        check_exposure(Settings(host="0.0.0.0"))
+        check_exposure(Settings(host="0.0.0.0"), store)
+    store.close()
     assert "VIPE_API_KEY" in compose()["services"]["api"]["environment"]
     assert "VIPE_API_KEY" not in compose()["services"]["agent"]["environment"]
     (api,) = (d for d in manifests() if d["kind"] == "Deployment" and d["metadata"]["name"] == "vipe-api")
