@@ -6,8 +6,10 @@ import os
 from pathlib import Path
 from typing import Literal, Self
 
-from pydantic import Field, SecretStr, field_validator, model_validator
+from pydantic import Field, IPvAnyNetwork, SecretStr, field_validator, model_validator
 from pydantic_settings import BaseSettings, SettingsConfigDict
+
+from services.network.addresses import NetworkPolicy
 
 
 def _default_data_dir() -> Path:
@@ -81,6 +83,42 @@ class Settings(BaseSettings):
     input_roots: tuple[Path, ...] = ()
     """Local inputs must lie below one of these directories, symbolic links resolved; empty: anywhere. As JSON list."""
 
+    http_hosts: tuple[str, ...] = ()
+    """Hosts that inputs may be downloaded from over `http(s)`: `media.example.org`, `*.example.org`, `*`, each also
+    with `:port` or `:*`; empty: no such inputs. As JSON list."""
+
+    http_networks: tuple[IPvAnyNetwork, ...] = ()
+    """Networks that are not public and that `http_hosts` may resolve to nevertheless, such as `10.1.0.0/16`. Loopback,
+    link-local, private, shared and multicast addresses are refused otherwise. As JSON list."""
+
+    s3_buckets: tuple[str, ...] = ()
+    """Buckets that inputs and outputs may name, `*` for any part of a name; empty: every bucket that the credentials
+    open. As JSON list."""
+
+    max_input_bytes: int = Field(default=1 << 38, ge=1)
+    """Largest input file: a video, an image, or a list of videos."""
+
+    max_manifest_rows: int = Field(default=10_000_000, ge=1)
+    """Most rows of one list of videos."""
+
+    max_pixels: int = Field(default=1 << 26, ge=1)
+    """Most pixels of one picture; the default is twice 8K."""
+
+    max_frames: int = Field(default=1_000_000, ge=1)
+    """Most frames of one video."""
+
+    max_duration_s: float = Field(default=43_200, gt=0)
+    """Longest video."""
+
+    max_decoded_bytes: int = Field(default=1 << 44, ge=1)
+    """Most bytes of all pictures of one video together, as RGB."""
+
+    max_streams: int = Field(default=64, ge=1)
+    """Most streams of one media file."""
+
+    max_decoder_memory_bytes: int = Field(default=1 << 32, ge=1 << 26)
+    """Memory that decoding one video may take, its index included."""
+
     output_roots: tuple[Path, ...] = ()
     """Local outputs must lie below one of these directories, symbolic links resolved; empty: anywhere. As JSON list."""
 
@@ -128,6 +166,11 @@ class Settings(BaseSettings):
         if (self.tls_cert_file is None) != (self.tls_key_file is None):
             raise ValueError("tls_cert_file and tls_key_file go together")
         return self
+
+    @field_validator("http_hosts")
+    @classmethod
+    def _host_patterns(cls, value: tuple[str, ...]) -> tuple[str, ...]:
+        return NetworkPolicy(value).hosts
 
     @field_validator("data_dir", "scratch_dir")
     @classmethod

@@ -9,6 +9,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
+from services.inputs.rules import InputRules
+from services.network.addresses import NetworkPolicy
+from vipe_core.video.limits import Limits
+
 if TYPE_CHECKING:
     from services.settings import Settings
 
@@ -54,7 +58,8 @@ class AgentConfig:
         recycle_growth_bytes: A worker is replaced that has grown by so much since its first video; 0: never.
         scratch_max_age_s: Leftovers of shards that nobody came back for are removed after this.
         engine: `module:callable` that opens an engine from (preset, camera, device).
-        input_roots: Where local inputs must lie; empty: anywhere.
+        inputs: What inputs may name.
+        media: Bounds on one video, see `vipe_core.video.Limits`.
         output_roots: Where local outputs must lie; empty: anywhere.
         s3_endpoint_url: S3 service other than AWS.
     """
@@ -87,7 +92,8 @@ class AgentConfig:
     recycle_growth_bytes: int = 4 << 30
     scratch_max_age_s: float = 86400.0
     engine: str = DEFAULT_ENGINE
-    input_roots: tuple[Path, ...] = ()
+    inputs: InputRules = field(default_factory=InputRules)
+    media: Limits = field(default_factory=Limits)
     output_roots: tuple[Path, ...] = ()
     s3_endpoint_url: str | None = None
     holder: str = field(default_factory=new_holder)
@@ -103,6 +109,30 @@ class AgentConfig:
             raise ValueError(f"lease_ttl_s must be positive, got {self.lease_ttl_s}")
         if not self.scratch_dir.is_absolute():
             raise ValueError(f"scratch_dir must be an absolute path, got {self.scratch_dir}")
+
+
+def input_rules(settings: Settings) -> InputRules:
+    """What the service's settings say about inputs."""
+    return InputRules(
+        roots=settings.input_roots,
+        buckets=settings.s3_buckets,
+        network=NetworkPolicy(settings.http_hosts, settings.http_networks),
+        max_file_bytes=settings.max_input_bytes,
+        max_rows=settings.max_manifest_rows,
+    )
+
+
+def media_limits(settings: Settings) -> Limits:
+    """What the service's settings say about the size of a video."""
+    return Limits(
+        max_pixels=settings.max_pixels,
+        max_frames=settings.max_frames,
+        max_duration_s=settings.max_duration_s,
+        max_decoded_bytes=settings.max_decoded_bytes,
+        max_file_bytes=settings.max_input_bytes,
+        max_streams=settings.max_streams,
+        max_memory_bytes=settings.max_decoder_memory_bytes,
+    )
 
 
 def config_from_settings(settings: Settings) -> AgentConfig:
@@ -122,7 +152,8 @@ def config_from_settings(settings: Settings) -> AgentConfig:
         recycle_videos=settings.recycle_videos,
         recycle_age_s=settings.recycle_age_s,
         recycle_growth_bytes=settings.recycle_growth_bytes,
-        input_roots=settings.input_roots,
+        inputs=input_rules(settings),
+        media=media_limits(settings),
         output_roots=settings.output_roots,
         s3_endpoint_url=settings.s3_endpoint_url,
     )

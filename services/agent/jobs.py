@@ -73,7 +73,7 @@ class JobKeeper:
                 self._store,
                 self._config.holder,
                 ttl_s=self._config.lease_ttl_s,
-                input_roots=self._config.input_roots,
+                rules=self._config.inputs,
                 output_roots=self._config.output_roots,
                 s3_endpoint_url=self._config.s3_endpoint_url,
                 backoff_base_s=self._config.backoff_base_s,

@@ -121,7 +121,8 @@ class RaySlot:
             config.engine,
             config.s3_endpoint_url,
             config.scratch_max_age_s,
-            config.input_roots,
+            config.inputs,
+            config.media,
         )
         level = logging.getLevelName(logging.getLogger().getEffectiveLevel())
         try:

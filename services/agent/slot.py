@@ -11,7 +11,7 @@ import resource
 import threading
 import time
 import traceback
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from services.agent.engine import Engine, load_opener
@@ -37,9 +37,11 @@ from services.agent.traffic import TrafficRecorder
 from services.domain.errors import InputUnavailable, ObjectMissing, ServiceError, StorageError
 from services.domain.models import VideoRef, VideoResult
 from services.domain.states import VideoStatus
+from services.inputs.fetching import Fetched, fetched
+from services.inputs.rules import InputRules
 from services.storage import open_store
-from services.storage.roots import lies_within
 from vipe_core.errors import EngineError, VipeError
+from vipe_core.video.limits import Limits, use_limits
 
 logger = logging.getLogger(__name__)
 
@@ -53,7 +55,8 @@ class SlotConfig:
     engine: str
     s3_endpoint_url: str | None
     scratch_max_age_s: float
-    input_roots: tuple[Path, ...] = ()
+    inputs: InputRules = field(default_factory=InputRules)
+    media: Limits = field(default_factory=Limits)
 
 
 class _Interrupted(BaseException):
@@ -77,6 +80,7 @@ class Slot:
         self._traffic = TrafficRecorder()
         self._cancel = threading.Event()
         self._progress = SlotProgress()
+        use_limits(config.media)
         config.scratch_dir.mkdir(parents=True, exist_ok=True)
         sweep(config.scratch_dir, config.scratch_max_age_s)
 
@@ -133,7 +137,19 @@ class Slot:
         self._progress = SlotProgress(video.key, "fetch")
         scratch = ShardScratch(self._config.scratch_dir, lease)
         engine = self._engine(lease.spec.preset, lease.spec.camera)
-        path, fetch_s = self._fetch(video, scratch)
+        with fetched(
+            video,
+            self._config.inputs,
+            lambda suffix: scratch.input_path(video.key, suffix),
+            s3_endpoint_url=self._config.s3_endpoint_url,
+            observer=self._traffic,
+        ) as local:
+            return self._annotate_local(task, engine, scratch, local, started)
+
+    def _annotate_local(
+        self, task: AnnotateVideo, engine: Engine, scratch: ShardScratch, local: Fetched, started: float
+    ) -> Answer:
+        lease, video, path = task.lease, task.video, local.path
         root = scratch.staging()
         failure: Failed
         try:
@@ -150,14 +166,11 @@ class Slot:
         except Exception as error:
             failure = _unforeseen(error, video.uri)
         else:
-            timings = {**({"fetch": fetch_s} if fetch_s else {}), **(result.timings_s or {})}
+            timings = {**({"fetch": local.seconds} if local.seconds else {}), **(result.timings_s or {})}
             seconds = round(time.perf_counter() - started, 4)
             result = replace(result, attempt=lease.attempt, seconds=seconds, timings_s=timings)
             scratch.keep(result)
             return Annotated(result)
-        finally:
-            if path.is_relative_to(scratch.path):
-                path.unlink(missing_ok=True)
         scratch.staging()
         if not failure.retryable:
             scratch.keep(failed_row(video, lease.attempt, failure.code, failure.message))
@@ -182,20 +195,6 @@ class Slot:
                 raise _JobFailure(error) from error
             self._engines = {(preset, camera): engine}  # One at a time: another preset's weights would stay in memory.
         return engine
-
-    def _fetch(self, video: VideoRef, scratch: ShardScratch) -> tuple[Path, float]:
-        """A local path of the input, and the seconds that it took to get it."""
-        if not video.uri.startswith("s3://"):
-            if not lies_within(video.uri, self._config.input_roots):
-                # It was listed inside, so somebody has put a link in its place.
-                raise InputUnavailable(f"{video.uri} lies outside of the directories that this service may read")
-            return Path(video.uri), 0.0
-        started = time.perf_counter()
-        bucket, _, key = video.uri.removeprefix("s3://").partition("/")
-        store = open_store(f"s3://{bucket}", endpoint_url=self._config.s3_endpoint_url, observer=self._traffic)
-        path = scratch.input_path(video.key, Path(key).suffix)
-        store.download(key, path)
-        return path, round(time.perf_counter() - started, 4)
 
     def _report(self, stage: str, frames_done: int, frames_total: int | None, share: float) -> None:
         if self._cancel.is_set():

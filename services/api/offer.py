@@ -6,6 +6,9 @@ import re
 from functools import cache
 from typing import Literal, get_args
 
+from services.domain.errors import AddressRefused
+from services.network.addresses import NetworkPolicy
+
 # What the engine writes for every video.
 OfferedAttribute = Literal["pose", "intrinsics", "depth", "rgb", "mask", "confidence"]
 ATTRIBUTES: tuple[OfferedAttribute, ...] = get_args(OfferedAttribute)
@@ -50,7 +53,7 @@ def known_length(value: str) -> str:
 
 
 def address(value: str) -> str:
-    """Check an absolute path or `s3://bucket/key`.
+    """Check an absolute path, `s3://bucket/key` or `http(s)://host/path`.
 
     Raises:
         ValueError: It is neither.
@@ -64,10 +67,16 @@ def address(value: str) -> str:
         if "?" in key or "#" in key:
             raise ValueError("an S3 address must not hold '?' or '#'")
         segments = key.rstrip("/").split("/") if key.rstrip("/") else []
+    elif value.startswith(("http://", "https://")):
+        try:
+            NetworkPolicy(("*:*",)).endpoint(value)
+        except AddressRefused as error:
+            raise ValueError(str(error)) from error
+        segments = []
     elif value.startswith("/") and not value.startswith("//"):
         segments = [s for s in value.split("/") if s]
     else:
-        raise ValueError(f"{value!r} must be an absolute path or s3://bucket/key")
+        raise ValueError(f"{value!r} must be an absolute path, s3://bucket/key or http(s)://host/path")
     if any(s in ("", ".", "..") for s in segments):
         raise ValueError("an address must not hold empty, '.' or '..' segments")
     return value

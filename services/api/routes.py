@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from functools import partial
-from pathlib import Path as FilePath
 from typing import Annotated
 
 from fastapi import APIRouter, Depends, Header, Path, Query, Request, Response
@@ -25,8 +24,10 @@ from services.api.schemas import (
     VideoPage,
     VideoView,
 )
-from services.domain.errors import InvalidRequest, JobNotFound
+from services.domain.errors import JobNotFound
+from services.domain.models import JobSpec
 from services.domain.states import JobState, VideoStatus
+from services.settings import Settings
 from services.store.base import Store
 
 
@@ -88,7 +89,7 @@ def create_job(
 ) -> JobView:
     """Create a job. Sent again within 7 days with the same `Idempotency-Key` and body, it gets its first answer."""
     spec = body.to_spec()
-    _check_output(spec.output, request.app.state.settings.output_roots)
+    _check_places(spec, request.app.state.settings)
     working: KeysInWork = request.app.state.keys_in_work
     with working.on(caller.tenant, idempotency_key):
         job, created = store.create_job(
@@ -100,14 +101,15 @@ def create_job(
     return JobView.of(job)
 
 
-def _check_output(output: str, roots: tuple[FilePath, ...]) -> None:
+def _check_places(spec: JobSpec, settings: Settings) -> None:
     """Refuse at once what planning would refuse later."""
-    if not roots or not output.startswith("/"):
-        return
-    from services.storage.roots import lies_within  # The storage clients behind it are slow to import.
+    from services.agent.config import input_rules  # The storage clients behind these are slow to import.
+    from services.planner.planning import check_output_place
 
-    if not lies_within(output, roots):
-        raise InvalidRequest(f"output {output} lies outside of the directories that this service may write")
+    rules = input_rules(settings)
+    for uri in spec.inputs:
+        rules.check(uri)
+    check_output_place(spec.output, settings.output_roots, rules.buckets)
 
 
 @router.get("", responses=responses(400, 401, 403, 422, 429, 503))

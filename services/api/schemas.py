@@ -27,7 +27,9 @@ class JobRequest(BaseModel):
     inputs: list[Address] = Field(
         min_length=1,
         max_length=1000,
-        description="Each a directory, a video file, `s3://bucket/key`, or `s3://bucket/prefix/` (trailing slash).",
+        description="Each a directory, a video file, `s3://bucket/key`, `s3://bucket/prefix/` (trailing slash), "
+        "`http(s)://host/path` where the operator allows the host, or a list of videos in one of these places: `.csv`, "
+        "`.jsonl` or `.parquet` with a column `uri`, and `key`, `size_bytes` and `etag` where they are known.",
     )
     output: Address = Field(description="A directory or `s3://bucket/prefix` that belongs to this job alone.")
     preset: Annotated[str, AfterValidator(lambda v: offer.one_of(v, offer.presets()))] = Field(
@@ -56,6 +58,8 @@ class JobRequest(BaseModel):
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
+        if "://" in self.output and not self.output.startswith("s3://"):
+            raise ValueError("output must be a directory or s3://bucket/prefix")
         if self.output.strip("/") == "":
             raise ValueError("output must not be the root directory")
         if self.output.rstrip("/") in {uri.rstrip("/") for uri in self.inputs}:

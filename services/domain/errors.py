@@ -93,6 +93,13 @@ class AddressRefused(ServiceError):
     status = 422
 
 
+class InvalidManifest(ServiceError):
+    """A list of videos that cannot be read, or a row of it that is not understood."""
+
+    code = "invalid_manifest"
+    status = 422
+
+
 class InputTooLarge(ServiceError):
     """An input has more bytes, rows or members than the settings allow."""
 

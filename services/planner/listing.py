@@ -1,55 +1,158 @@
-"""Expand inputs into videos: directories, files, S3 objects and prefixes. One video at a time, in a fixed order."""
+"""Expand inputs into videos: directories, files, S3 objects and prefixes, web addresses, and lists of any of these.
+
+One video at a time, in a fixed order, in bounded memory.
+"""
 
 from __future__ import annotations
 
 import os
 import stat
-from collections.abc import Iterator, Sequence
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import BinaryIO
+from urllib.parse import urlsplit
 
-from services.domain.errors import InputUnavailable, ObjectMissing
+from services.domain.errors import (
+    InputTooLarge,
+    InputUnavailable,
+    InvalidManifest,
+    ObjectMissing,
+    ServiceError,
+)
+from services.inputs.download import download, look
+from services.inputs.rules import WEB_SCHEMES, InputRules
+from services.network.http import GuardedHttp
+from services.planner.manifest import Row, is_manifest, read_manifest
 from services.storage.open import open_store
 from services.storage.roots import lies_within
 
 VIDEO_EXTENSIONS = frozenset(
     {".mp4", ".mov", ".mkv", ".webm", ".avi", ".m4v", ".mpg", ".mpeg", ".ts", ".gif"},
 )
+_MAX_MANIFEST_BYTES = 8 << 30
 IMAGE_EXTENSIONS = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp"})
 
 
 @dataclass(frozen=True, slots=True)
 class Found:
-    """A video as listed."""
+    """A video as listed.
+
+    Attributes:
+        size_bytes: 0 where nobody says.
+        etag: What tells whether it changes until it is fetched, where there is one.
+        key: The key that its list gives it.
+    """
 
     uri: str
     size_bytes: int
     etag: str | None = None
+    key: str | None = None
 
 
-def expand(uri: str, *, input_roots: Sequence[Path] = (), s3_endpoint_url: str | None = None) -> Iterator[Found]:
+def expand(uri: str, rules: InputRules | None = None, *, s3_endpoint_url: str | None = None) -> Iterator[Found]:
     """The videos of one input.
 
     A directory is walked recursively in name order; names that start with a dot are left out, and so are links that
     leave the directory and links to directories. A directory without videos but with images is one video. A file is
-    one video whatever its name.
+    one video whatever its name, unless it is a list (`.csv`, `.jsonl`, `.parquet`; see `planner.manifest`).
 
     Args:
-        uri: An absolute path, `s3://bucket/key`, or `s3://bucket/prefix/`.
-        input_roots: Where local inputs must lie, links resolved; empty: anywhere.
+        uri: An absolute path, `s3://bucket/key`, `s3://bucket/prefix/`, or `http(s)://host/path`.
+        rules: What may be named; by default what `InputRules()` says.
         s3_endpoint_url: S3 service other than AWS.
 
     Raises:
         InputUnavailable: It does not exist, is not readable, lies outside of the roots, or holds no video.
-        StorageError: S3 does not answer.
+        InvalidManifest, InputTooLarge: A list that is not understood, or an input above the limits.
+        AddressRefused, InvalidRequest: An address that must not be named.
+        HttpFailed, StorageError: Whoever has it does not answer.
     """
-    videos = _expand_s3(uri, s3_endpoint_url) if uri.startswith("s3://") else _expand_local(uri, input_roots)
-    for video in videos:
+    rules = rules or InputRules()
+    rules.check(uri)
+    for video in _expand(uri, rules, s3_endpoint_url):
         try:
             video.uri.encode()
         except UnicodeEncodeError:
             raise InputUnavailable(f"the name of {video.uri!a} is not valid UTF-8; rename the file") from None
         yield video
+
+
+def _expand(uri: str, rules: InputRules, s3_endpoint_url: str | None) -> Iterator[Found]:
+    if is_manifest(urlsplit(uri).path if uri.startswith(WEB_SCHEMES) else uri) and not Path(uri).is_dir():
+        yield from _expand_manifest(uri, rules, s3_endpoint_url)
+    elif uri.startswith("s3://"):
+        yield from _expand_s3(uri, s3_endpoint_url)
+    elif uri.startswith(WEB_SCHEMES):
+        uri = uri.partition("#")[0]
+        with GuardedHttp(rules.network) as http:
+            found = look(http, uri)
+        if found.size_bytes > rules.max_file_bytes:
+            raise InputTooLarge(f"{uri} has more than the {rules.max_file_bytes} bytes that are allowed")
+        yield Found(uri, found.size_bytes, found.etag)
+    else:
+        yield from _expand_local(uri, rules)
+
+
+def _expand_manifest(uri: str, rules: InputRules, s3_endpoint_url: str | None) -> Iterator[Found]:
+    name = urlsplit(uri).path if uri.startswith(WEB_SCHEMES) else uri
+    name = name.rstrip("/").rsplit("/", 1)[-1]
+    with _local_copy(uri, rules, s3_endpoint_url) as file:
+        for row in read_manifest(file, name, max_rows=rules.max_rows):
+            yield _listed(row, name, rules)
+
+
+def _listed(row: Row, name: str, rules: InputRules) -> Found:
+    """The video of a row. Whether it exists is not asked: one that does not becomes a failed video."""
+    try:
+        rules.check(row.uri)
+    except ServiceError as error:
+        raise InvalidManifest(f"{name}, row {row.number}: {error}") from error
+    if row.uri.startswith(WEB_SCHEMES):
+        return Found(row.uri.partition("#")[0], row.size_bytes, row.etag, row.key)
+    if row.uri.startswith("s3://"):
+        if row.uri.endswith("/"):
+            raise InvalidManifest(f"{name}, row {row.number}: {row.uri} is a prefix; a row names one video")
+        return Found(row.uri, row.size_bytes, row.etag, row.key)
+    path = os.path.normpath(row.uri)
+    try:
+        size_bytes = row.size_bytes or Path(path).stat().st_size
+    except OSError:
+        size_bytes = 0
+    return Found(path, size_bytes, None, row.key)
+
+
+@contextmanager
+def _local_copy(uri: str, rules: InputRules, s3_endpoint_url: str | None) -> Iterator[BinaryIO]:
+    """A list as a file that can be read in any order."""
+    with tempfile.TemporaryDirectory(prefix="manifest-") as folder:
+        copy = Path(folder, "manifest")
+        if uri.startswith("s3://"):
+            bucket, _, key = uri.removeprefix("s3://").partition("/")
+            store = open_store(f"s3://{bucket}", endpoint_url=s3_endpoint_url)
+            info = store.head(key)
+            if info is None:
+                raise InputUnavailable(f"there is no object {uri}")
+            _check_manifest_size(uri, info.size_bytes, rules)
+            store.download(key, copy)
+        elif uri.startswith(WEB_SCHEMES):
+            with GuardedHttp(rules.network) as http:
+                download(http, uri, copy, max_bytes=min(rules.max_file_bytes, _MAX_MANIFEST_BYTES))
+        else:
+            descriptor = rules.open_local(uri)
+            with os.fdopen(descriptor, "rb") as local:
+                _check_manifest_size(uri, os.fstat(descriptor).st_size, rules)
+                yield local
+            return
+        with copy.open("rb") as file:
+            yield file
+
+
+def _check_manifest_size(uri: str, size_bytes: int, rules: InputRules) -> None:
+    if size_bytes > min(rules.max_file_bytes, _MAX_MANIFEST_BYTES):
+        raise InputTooLarge(f"the list {uri} has {size_bytes} bytes; split it into several jobs")
 
 
 def _expand_s3(uri: str, endpoint_url: str | None) -> Iterator[Found]:
@@ -72,7 +175,7 @@ def _expand_s3(uri: str, endpoint_url: str | None) -> Iterator[Found]:
         raise InputUnavailable(f"no videos found under {uri}")
 
 
-def _expand_local(uri: str, input_roots: Sequence[Path]) -> Iterator[Found]:
+def _expand_local(uri: str, rules: InputRules) -> Iterator[Found]:
     path = Path(os.path.normpath(uri))
     try:
         resolved = path.resolve(strict=True)
@@ -80,7 +183,7 @@ def _expand_local(uri: str, input_roots: Sequence[Path]) -> Iterator[Found]:
     except (OSError, RuntimeError) as error:
         reason = "it does not exist" if isinstance(error, FileNotFoundError) else str(error)
         raise InputUnavailable(f"cannot read input {uri}: {reason}") from error
-    if not lies_within(resolved, input_roots):
+    if not lies_within(resolved, rules.roots):
         raise InputUnavailable(f"input {uri} lies outside of the directories that this service may read")
     if stat.S_ISREG(status.st_mode):
         yield Found(str(path), status.st_size)

@@ -6,6 +6,7 @@ import sqlite3
 from collections.abc import Iterable, Iterator
 from types import TracebackType
 
+from services.domain.errors import InvalidManifest
 from services.domain.models import ShardPlan, VideoRef, video_key
 from services.planner.listing import Found
 
@@ -34,10 +35,22 @@ class SeenVideos:
         """Remember a video that is planned already."""
         self._db.execute("INSERT INTO seen VALUES (?, ?)", (key, uri))
 
-    def new_key(self, uri: str) -> str | None:
-        """The key of a video, None if its address was there before."""
+    def new_key(self, uri: str, wanted: str | None = None) -> str | None:
+        """The key of a video, None if its address was there before.
+
+        Args:
+            wanted: The key that its list gives it.
+
+        Raises:
+            InvalidManifest: Another video has this key.
+        """
         if self._db.execute("SELECT 1 FROM seen WHERE uri = ?", (uri,)).fetchone() is not None:
             return None
+        if wanted is not None:
+            if self._db.execute("SELECT 1 FROM seen WHERE key = ?", (wanted,)).fetchone() is not None:
+                raise InvalidManifest(f"two videos of the job have the key {wanted!r}; one of them is {uri}")
+            self.add(wanted, uri)
+            return wanted
         key = video_key(uri)
         if self._db.execute("SELECT 1 FROM seen WHERE key = ?", (key,)).fetchone() is not None:
             key = video_key(uri, hex_digits=16)
@@ -48,7 +61,7 @@ class SeenVideos:
 def new_videos(found: Iterable[Found], seen: SeenVideos) -> Iterator[VideoRef]:
     """The videos whose address was not there before."""
     for video in found:
-        key = seen.new_key(video.uri)
+        key = seen.new_key(video.uri, video.key)
         if key is not None:
             yield VideoRef(key, video.uri, video.size_bytes, video.etag)
 

@@ -26,6 +26,7 @@ from services.domain.errors import (
     code_and_message,
 )
 from services.domain.models import Job, ShardPlan
+from services.inputs.rules import InputRules, check_bucket
 from services.planner.listing import Found, expand
 from services.planner.packing import SeenVideos, new_videos, pack
 from services.storage.base import ObjectStore
@@ -46,7 +47,7 @@ def plan_next(
     holder: str,
     *,
     ttl_s: float = 60.0,
-    input_roots: Sequence[Path] = (),
+    rules: InputRules | None = None,
     output_roots: Sequence[Path] = (),
     s3_endpoint_url: str | None = None,
     give_up_after_s: float = 120.0,
@@ -59,7 +60,7 @@ def plan_next(
         store: Where the jobs are.
         holder: Who plans: a name that no other planner ever has.
         ttl_s: Another planner takes over what nothing was heard of for so long.
-        input_roots: Where local inputs must lie; empty: anywhere.
+        rules: What inputs may name.
         output_roots: Where local outputs must lie; empty: anywhere.
         s3_endpoint_url: S3 service other than AWS.
         give_up_after_s: For how long a job is tried again whose planning fails for reasons that can pass, storage that
@@ -80,7 +81,7 @@ def plan_next(
         return True
     turn = Turn(store, job.id, fence, ttl_s)
     try:
-        plan(turn, input_roots=input_roots, output_roots=output_roots, s3_endpoint_url=s3_endpoint_url)
+        plan(turn, rules=rules, output_roots=output_roots, s3_endpoint_url=s3_endpoint_url)
     except StoreUnavailable:
         raise
     except Exception as error:
@@ -142,7 +143,7 @@ class Turn:
 def plan(
     turn: Turn,
     *,
-    input_roots: Sequence[Path] = (),
+    rules: InputRules | None = None,
     output_roots: Sequence[Path] = (),
     s3_endpoint_url: str | None = None,
 ) -> None:
@@ -155,11 +156,12 @@ def plan(
         StorageError: Storage does not answer.
     """
     job = turn.store.get_job(turn.job_id)  # Not before the turn began: from now on nobody else adds shards.
-    check_output_place(job.spec.output, output_roots)
+    rules = rules or InputRules()
+    check_output_place(job.spec.output, output_roots, rules.buckets)
     with SeenVideos() as seen:
         for row in turn.keep(_planned(job, turn.store)):
             seen.add(row.ref.key, row.ref.uri)
-        found = turn.keep(_expand_all(job.spec.inputs, input_roots, s3_endpoint_url))
+        found = turn.keep(_expand_all(job.spec.inputs, rules, s3_endpoint_url))
         shards = pack(
             new_videos(found, seen),
             max_videos=job.spec.shard_max_videos,
@@ -176,8 +178,10 @@ def plan(
         turn.finish()
 
 
-def check_output_place(output: str, roots: Sequence[Path]) -> None:
-    """Raises StorageRefused if a local output lies outside of `roots`; no roots: anywhere."""
+def check_output_place(output: str, roots: Sequence[Path], buckets: tuple[str, ...] = ()) -> None:
+    """Raises StorageRefused if a local output lies outside of `roots`, AddressRefused if its bucket is not allowed."""
+    if output.startswith("s3://"):
+        check_bucket(output, buckets)
     if output.startswith("/") and not lies_within(output, roots):
         raise StorageRefused(f"output {output} lies outside of the directories that this service may write")
 
@@ -251,9 +255,9 @@ def _taken_key(output: ObjectStore) -> str | None:
     return next((info.key for folder in FOLDERS for info in output.list(folder)), None)
 
 
-def _expand_all(inputs: Sequence[str], roots: Sequence[Path], s3_endpoint_url: str | None) -> Iterator[Found]:
+def _expand_all(inputs: Sequence[str], rules: InputRules, s3_endpoint_url: str | None) -> Iterator[Found]:
     for uri in inputs:
-        yield from expand(uri, input_roots=roots, s3_endpoint_url=s3_endpoint_url)
+        yield from expand(uri, rules, s3_endpoint_url=s3_endpoint_url)
 
 
 def _batches(shards: Iterator[ShardPlan]) -> Iterator[list[ShardPlan]]:

@@ -27,6 +27,7 @@ from services.agent.messages import (
 from services.agent.scratch import ShardScratch, sweep
 from services.agent.slot import Slot, SlotConfig
 from services.domain.models import Lease, VideoRef, video_key
+from services.inputs.rules import InputRules
 
 
 def _config(root: Path, endpoint: str | None = None, engine: str = "agent_engines:open_in_memory") -> SlotConfig:
@@ -61,7 +62,7 @@ def test_an_input_that_became_a_link_out_of_its_roots_is_not_read(rig: Rig, tmp_
     secret = tmp_path / "secret.mp4"
     secret.write_text("frames=3")
     path = Path(lease.videos[0].uri)
-    slot = Slot(replace(_config(tmp_path), input_roots=(path.parent,)))
+    slot = Slot(replace(_config(tmp_path), inputs=InputRules(roots=(path.parent,))))
     assert isinstance(slot.run(OpenShard(lease)).answer, Opened)
     path.unlink()
     path.symlink_to(secret)

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from network_servers import Web, page, redirect, serve
+from web_server import Web, page, redirect, serve
 
 from services.domain.errors import AddressRefused, HttpFailed, NameUnresolved, ServiceError
 from services.network import GuardedHttp, NetworkPolicy, refusal_of

@@ -17,6 +17,7 @@ from moto.server import ThreadedMotoServer
 from services.domain.errors import InputUnavailable, StorageError
 from services.domain.models import JobSpec, VideoRef, video_key
 from services.domain.states import JobState
+from services.inputs.rules import InputRules
 from services.planner import Turn, plan_next
 from services.planner.listing import Found, expand
 from services.planner.packing import SeenVideos, new_videos, pack, shard_room
@@ -115,13 +116,13 @@ class TestDirectories:
 
     def test_roots(self, videos: Path, tmp_path: Path) -> None:
         make(videos, "a.mp4")
-        assert len(list(expand(str(videos), input_roots=[tmp_path]))) == 1
+        assert len(list(expand(str(videos), InputRules(roots=(tmp_path,))))) == 1
         other = tmp_path / "other"
         other.mkdir()
         (other / "way-out").symlink_to(videos)
         for uri in (videos, f"{videos}/a.mp4", f"{other}/../videos", other / "way-out"):
             with pytest.raises(InputUnavailable, match="outside"):
-                list(expand(str(uri), input_roots=[other]))
+                list(expand(str(uri), InputRules(roots=(other,))))
 
 
 class TestPacking:

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from vipe_core.errors import EmptyMedia, MediaNotFound
-from vipe_core.video.limits import Limits
+from vipe_core.video.limits import Limits, default_limits
 from vipe_core.video.naming import sanitise_name
 from vipe_core.video.probe import is_directory
 from vipe_core.video.process import DecoderProcess, report_protections
@@ -53,7 +53,7 @@ class ImageDirectorySource:
     ) -> None:
         if not fps > 0:
             raise ValueError(f"fps must be positive, got {fps}")
-        self._limits = limits or Limits()
+        self._limits = limits or default_limits()
         self._stall_s = stall_s
         self._root = Path(path).absolute()
         listed = _list_images(self._root)

@@ -84,3 +84,16 @@ class Limits:
             f"{label}: decoding needs more than the {self.max_memory_bytes} bytes of memory that are allowed; "
             "re-encode the video, or scale it down"
         )
+
+
+_default = Limits()
+
+
+def use_limits(limits: Limits) -> None:
+    """Make these the bounds of everything in this process that names none of its own."""
+    global _default
+    _default = limits
+
+
+def default_limits() -> Limits:
+    return _default

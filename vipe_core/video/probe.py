@@ -6,7 +6,7 @@ import stat
 from pathlib import Path
 
 from vipe_core.errors import EmptyMedia, UnsupportedMedia
-from vipe_core.video.limits import Limits
+from vipe_core.video.limits import Limits, default_limits
 from vipe_core.video.naming import sanitise_name
 from vipe_core.video.opened import not_found
 from vipe_core.video.process import DecoderProcess, report_protections
@@ -73,7 +73,7 @@ def probe(
         root=str(path.absolute().parent),
         files=(path.name,),
         images=False,
-        limits=limits or Limits(),
+        limits=limits or default_limits(),
         size=None,
         start=0,
         stop=None,

@@ -7,7 +7,7 @@ import os
 from pathlib import Path
 from typing import Any
 
-from vipe_core.video.limits import Limits
+from vipe_core.video.limits import Limits, default_limits
 from vipe_core.video.probe import PROBE_BUDGET_S, file_size_bytes, probe
 from vipe_core.video.process import DecoderProcess
 from vipe_core.video.source import Frame, FrameStream, VideoInfo
@@ -50,7 +50,7 @@ class VideoFileSource:
         stall_s: float = STALL_S,
         threads: int | None = None,
     ) -> None:
-        self._limits = limits or Limits()
+        self._limits = limits or default_limits()
         self._stall_s = stall_s
         self._threads = threads or default_threads()
         self._path = Path(path).absolute()
