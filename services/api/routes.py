@@ -24,7 +24,7 @@ from services.api.schemas import (
     VideoPage,
     VideoView,
 )
-from services.domain.errors import JobNotFound
+from services.domain.errors import InvalidRequest, JobNotFound, StorageRefused
 from services.domain.models import JobSpec
 from services.domain.states import JobState, VideoStatus
 from services.settings import Settings
@@ -109,7 +109,10 @@ def _check_places(spec: JobSpec, settings: Settings) -> None:
     rules = input_rules(settings)
     for uri in spec.inputs:
         rules.check(uri)
-    check_output_place(spec.output, settings.output_roots, rules.buckets)
+    try:
+        check_output_place(spec.output, settings.output_roots, rules.buckets)
+    except StorageRefused as error:
+        raise InvalidRequest(str(error)) from error
 
 
 @router.get("", responses=responses(400, 401, 403, 422, 429, 503))

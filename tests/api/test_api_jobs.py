@@ -76,7 +76,9 @@ class TestCreate:
             ({"inputs": []}, "body.inputs"),
             ({"inputs": "/videos"}, "body.inputs"),
             ({"inputs": ["videos"]}, "body.inputs.0"),
-            ({"inputs": ["/ok", "http://host/clip.mp4"]}, "body.inputs.1"),
+            ({"inputs": ["/ok", "ftp://host/clip.mp4"]}, "body.inputs.1"),
+            ({"inputs": ["/ok", "http://user:secret@host/clip.mp4"]}, "body.inputs.1"),
+            ({"output": "https://host/out"}, "body"),
             ({"inputs": ["s3://Bucket/x"]}, "body.inputs.0"),
             ({"inputs": ["s3://"]}, "body.inputs.0"),
             ({"inputs": ["/a/../../etc"]}, "body.inputs.0"),
@@ -103,6 +105,10 @@ class TestCreate:
         problem = assert_problem(http.post("/v1/jobs", json=body(**changes)), 422, "invalid_request")
         assert [e["field"] for e in problem["errors"]] == [field]
         assert field in problem["detail"]
+
+    def test_a_web_server_that_is_not_allowed(self, http: httpx.Client) -> None:
+        answer = http.post("/v1/jobs", json=body(inputs=["https://host/clip.mp4"]))
+        assert "allowed: none" in assert_problem(answer, 422, "address_refused")["detail"]
 
     def test_a_preset_that_is_not_offered_names_those_that_are(self, http: httpx.Client) -> None:
         problem = assert_problem(http.post("/v1/jobs", json=body(preset="magic")), 422, "invalid_request")
