@@ -140,18 +140,31 @@ class Agent:
         return False
 
     def _recover_executor(self) -> None:
-        """Start the executor anew when not one slot gets a process: then it is not the slots."""
+        """Start the executor anew when its machinery is gone, or not one slot gets a process: then it is not the slots.
+
+        Slots that are at work find their processes gone, blame nobody and go on when there is something to go on with.
+        """
+        now = time.monotonic()
+        if now < self._recover_after_s:
+            return
+        gone = not self._executor.healthy()
         with self._lock:
             states = set(self._states.values())
-        if states != {SlotState.LOST} or time.monotonic() < self._recover_after_s:
+        if not gone and states != {SlotState.LOST}:
+            self._recoveries.succeeded()
             return
-        logger.error("no worker process starts in any slot: the executor is started anew")
-        self._recover_after_s = time.monotonic() + self._config.start_timeout_s + self._recoveries.failed()
+        why = "Ray's head is gone" if gone else "no worker process starts in any slot"
+        logger.error("%s: the executor is started anew", why)
         try:
             self._executor.restart()
         except Exception as error:
-            logger.exception("the executor did not start: %s", error)
+            delay_s = self._recoveries.failed()
+            self._recover_after_s = time.monotonic() + delay_s
+            logger.exception("the executor did not start, next try in %.1f s: %s", delay_s, error)
             return
+        self._metrics.executor_restarts.inc()
+        # The slots need their time to start before anything can be said of them.
+        self._recover_after_s = 0.0 if gone else time.monotonic() + self._config.start_timeout_s
         with self._lock:
             self._states = dict.fromkeys(self._states, SlotState.STARTING)
         self._publish_slots()

@@ -60,6 +60,9 @@ class Executor(Protocol):
     def restart(self) -> None:
         """Start the machinery anew after it was lost. Handles stay valid; their processes are gone."""
 
+    def healthy(self) -> bool:
+        """Whether the machinery is there; quick. Where it is not, `restart` is called for."""
+
     def slots(self) -> list[SlotHandle]:
         """One handle per slot, not started yet."""
 

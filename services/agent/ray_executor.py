@@ -22,13 +22,14 @@ import socket
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 from services.agent.config import AgentConfig
 from services.agent.executor import Died, SlotHandle
 from services.agent.messages import Failed, Reply, SlotProgress, Task
+from services.agent.ray_health import RayGate, RayGone, all_alive, answers, head_processes
 from services.agent.slot import Slot, SlotConfig
 from services.observability.logging import configure_logging
 from vipe_core.errors import ConfigError, EngineError
@@ -41,14 +42,21 @@ _MAX_SOCKET_PATH = 107
 _PROGRESS_INTERVAL_S = 0.5
 _KILL_PATIENCE_S = 2.0
 _NAMESPACE = "vipe"
+_STEP_S = 0.5  # No call into Ray takes longer, so that Ray can be replaced.
+_LEAVE_TIMEOUT_S = 30.0
+_CLUSTER_PATIENCE_S = 10.0
+_GONE = Died("Ray's head is gone", preempted=True)
 _THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
 
-# Read by Ray when it starts. A private Ray reports to nobody, and its helpers outlive its head by seconds only.
-# Its own signal handler would end this process three seconds after a SIGTERM, in the middle of an orderly stop.
+# Read by Ray when it is imported: no call may start another Ray by itself.
+_ENVIRONMENT = {"RAY_ENABLE_AUTO_CONNECT": "0"}
+# A private Ray reports to nobody. Where its head is gone, its processes, and this one, end after the time that is given
+# here: after we have replaced it, and soon enough where this process is gone, too. Its own signal handler would end
+# this process three seconds after a SIGTERM, in the middle of an orderly stop.
 _PRIVATE_ENVIRONMENT = {
     "RAY_USAGE_STATS_ENABLED": "0",
     "RAY_DISABLE_FAILURE_SIGNAL_HANDLER": "1",
-    "RAY_gcs_rpc_server_reconnect_timeout_s": "30",
+    "RAY_gcs_rpc_server_reconnect_timeout_s": "120",
     "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0",
 }
 
@@ -81,9 +89,10 @@ class SlotActor:
 class RaySlot:
     """A `SlotHandle` on a Ray actor."""
 
-    def __init__(self, number: int, actor_class: Callable[[], Any], config: AgentConfig, *, private: bool) -> None:
+    def __init__(self, number: int, executor: RayExecutor, config: AgentConfig, *, private: bool) -> None:
         self._number = number
-        self._actor_class = actor_class
+        self._executor = executor
+        self._gate = executor.gate
         self._config = config
         self._private = private
         self._actor: Any = None
@@ -106,8 +115,21 @@ class RaySlot:
         return self._place
 
     def start(self, timeout_s: float) -> Died | None:
-        import ray
         from ray.exceptions import RayError
+
+        deadline = time.monotonic() + timeout_s
+        if not self._gate.wait_open(timeout_s):
+            return _GONE
+        try:
+            return self._start(deadline)
+        except RayError as error:
+            return self._judged(_died(error))
+        except RayGone:
+            self._actor = None
+            return _GONE
+
+    def _start(self, deadline: float) -> Died | None:
+        import ray
         from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
         config = self._config
@@ -125,11 +147,16 @@ class RaySlot:
             config.media,
         )
         level = logging.getLevelName(logging.getLogger().getEffectiveLevel())
-        try:
-            self._actor = self._actor_class().options(**options).remote(slot_config, level)
-            self._node_id, self._pid, host, gpus = ray.get(self._actor.identity.remote(), timeout=timeout_s)
-        except RayError as error:
-            return _died(error)
+        with self._gate.inside():
+            self._actor = self._executor.actor_class.options(**options).remote(slot_config, level)
+            identity = self._actor.identity.remote()
+        while True:
+            with self._gate.inside():
+                if ray.wait([identity], timeout=_STEP_S)[0]:
+                    self._node_id, self._pid, host, gpus = ray.get(identity)
+                    break
+            if time.monotonic() > deadline:
+                return Died("the process was not ready in time")
         self._place = f"{host}/gpu-{','.join(gpus)}" if gpus else f"{host}/slot-{self._number}"
         with self._lock:
             self._progress, self._progress_call = SlotProgress(), None
@@ -140,24 +167,34 @@ class RaySlot:
             raise RuntimeError("a slot takes one task at a time, and only while its process lives")
         with self._lock:  # What is known is about the task before this one.
             self._progress, self._progress_call = SlotProgress(), None
-        self._task = self._actor.run.remote(task)
+        try:
+            with self._gate.inside():
+                self._task = self._actor.run.remote(task)
+        except RayGone:
+            self._task = None  # `poll` tells.
 
     def poll(self, timeout_s: float) -> Reply | Died | None:
         import ray
         from ray.exceptions import RayError, RayTaskError
 
+        if self._task is None:
+            return _GONE
         try:
-            ready, _ = ray.wait([self._task], timeout=timeout_s)
-            if not ready:
-                return None
-            reply: Reply = ray.get(ready[0])
+            with self._gate.inside():
+                ready, _ = ray.wait([self._task], timeout=timeout_s)
+                if not ready:
+                    return None
+                reply: Reply = ray.get(ready[0])
         except RayTaskError as error:
             self._task = None
             first = str(error.cause or error).splitlines()[0]
             return Reply(Failed(EngineError.code, f"a worker's reply was lost: {first}", False, "shard", str(error)))
         except RayError as error:
             self._task = None
-            return _died(error)
+            return self._judged(_died(error))
+        except RayGone:
+            self._task = None
+            return _GONE
         self._task = None
         return reply
 
@@ -168,16 +205,17 @@ class RaySlot:
         with self._lock:
             actor, call = self._actor, self._progress_call
             try:
-                if call is not None and ray.wait([call], timeout=0)[0]:
-                    self._progress_call = None
-                    self._progress = ray.get(call)
-                elif call is not None:
-                    return self._progress
-                now = time.monotonic()
-                if actor is not None and now - self._progress_asked_s >= _PROGRESS_INTERVAL_S:
-                    self._progress_asked_s = now
-                    self._progress_call = actor.progress.remote()
-            except RayError:
+                with self._gate.inside():
+                    if call is not None and ray.wait([call], timeout=0)[0]:
+                        self._progress_call = None
+                        self._progress = ray.get(call)
+                    elif call is not None:
+                        return self._progress
+                    now = time.monotonic()
+                    if actor is not None and now - self._progress_asked_s >= _PROGRESS_INTERVAL_S:
+                        self._progress_asked_s = now
+                        self._progress_call = actor.progress.remote()
+            except (RayError, RayGone):
                 self._progress_call = None  # The task itself will tell that the process died.
             return self._progress
 
@@ -185,7 +223,7 @@ class RaySlot:
         from ray.exceptions import RayError
 
         if self._actor is not None:
-            with contextlib.suppress(RayError):
+            with contextlib.suppress(RayError, RayGone), self._gate.inside():
                 self._actor.cancel.remote()
 
     def kill(self) -> None:
@@ -197,10 +235,14 @@ class RaySlot:
             self._progress, self._progress_call = SlotProgress(), None
         if actor is None:
             return
-        with contextlib.suppress(Exception):  # Ray itself may be gone; then so is the actor.
+        with contextlib.suppress(Exception), self._gate.inside():  # Ray itself may be gone; then so is the actor.
             ray.kill(actor, no_restart=True)
         if self._private and pid is not None:
             _ensure_gone(pid)
+
+    def _judged(self, died: Died) -> Died:
+        """A worker that ends together with Ray's head is nobody's fault."""
+        return died if died.preempted or self._executor.healthy() else _GONE
 
 
 class RayExecutor:
@@ -216,7 +258,10 @@ class RayExecutor:
         # Asked here and not in `start`, which is tried again and again: too many slots will not fit later either.
         self._num_slots = slots_on_this_machine(config) if self._private else config.slots
         self._temp_dir: Path | None = None
-        self._actor_class: Any = None
+        self._head: dict[int, str] = {}
+        self._address = ""
+        self.gate = RayGate()
+        self.actor_class: Any = None
         self._slots: list[RaySlot] = []
 
     def start(self) -> None:
@@ -227,14 +272,23 @@ class RayExecutor:
         """
         self._connect()
         self._slots = [
-            RaySlot(number, lambda: self._actor_class, self._config, private=self._private)
-            for number in range(self._num_slots or 1)
+            RaySlot(number, self, self._config, private=self._private) for number in range(self._num_slots or 1)
         ]
 
     def restart(self) -> None:
         """Leave a Ray that does not answer and start or join again. Raises what `start` raises."""
         self._disconnect()
         self._connect()
+
+    def healthy(self, patience_s: float = _CLUSTER_PATIENCE_S) -> bool:
+        """Whether Ray's head is there: its processes, or where it belongs to others, its address.
+
+        Args:
+            patience_s: For how long a cluster may not answer.
+        """
+        if not self.gate.is_open:
+            return False
+        return all_alive(self._head) if self._private else answers(self._address, patience_s)
 
     def slots(self) -> list[SlotHandle]:
         return list(self._slots)
@@ -254,6 +308,8 @@ class RayExecutor:
 
     def _connect_or_raise(self) -> None:
         started = time.monotonic()
+        for name, value in _ENVIRONMENT.items():
+            os.environ.setdefault(name, value)
         if self._private:
             self._start_private()
         else:
@@ -267,14 +323,22 @@ class RayExecutor:
             )
             if self._num_slots is None:
                 self._num_slots = self._slots_on_the_cluster()
-        self._actor_class = self._new_actor_class()
+        import ray
+
+        self._head = head_processes() if self._private else {}
+        self._address = ray.get_runtime_context().gcs_address
+        self.actor_class = self._new_actor_class()
+        self.gate.open()
         logger.info("Ray is ready after %.1f s", time.monotonic() - started)
 
     def _disconnect(self) -> None:
         import ray
 
-        for slot in self._slots:
-            slot.kill()
+        if self.healthy():
+            for slot in self._slots:
+                slot.kill()
+        if not self.gate.close(_LEAVE_TIMEOUT_S):
+            logger.warning("a call into Ray does not return; it is shut down all the same")
         ray.shutdown()
         if self._temp_dir is not None:
             shutil.rmtree(self._temp_dir, ignore_errors=True)

@@ -123,6 +123,11 @@ class Metrics:
             ["reason"],
             registry=registry,
         )
+        self.executor_restarts = Counter(
+            "vipe_executor_restarts_total",
+            "How often Ray was started or joined anew because its head, or every worker process, was gone.",
+            registry=registry,
+        )
         self.actors = Gauge(
             "vipe_actors",
             "Worker slots by role and state: starting, idle, busy, fenced, lost.",

@@ -94,6 +94,9 @@ class ThreadExecutor:
         self.restarts += 1
         self.lost = False
 
+    def healthy(self) -> bool:
+        return True
+
     def slots(self) -> list[SlotHandle]:
         return [ThreadSlot(self._config, self) for _ in range(self._config.slots)]
 

@@ -20,6 +20,7 @@ from services.agent.config import AgentConfig
 from services.agent.executor import Died
 from services.agent.messages import Annotated, AnnotateVideo, Cancelled, Opened, OpenShard, Reply
 from services.agent.ray_executor import RayExecutor, RaySlot
+from services.agent.ray_health import head_processes
 from services.commit.reconcile import committed_records
 from services.domain.models import Job, JobSpec, ShardPlan, VideoRef, VideoResult, video_key
 from services.domain.states import JobState, VideoStatus
@@ -201,6 +202,32 @@ def test_deaths_and_poison_leave_the_others_unharmed(tmp_path: Path) -> None:
     assert metrics.registry.get_sample_value("vipe_actor_restarts_total", {"reason": "died"}) == 4
     assert metrics.registry.get_sample_value("vipe_videos_total", {"outcome": "succeeded", "error_class": ""}) == 3
     assert (tmp_path / "out" / "dataset.json").exists()
+
+
+@pytest.mark.parametrize("victims", [{"gcs_server"}, {"gcs_server", "raylet"}])
+def test_the_loss_of_the_head_costs_the_running_video_and_blames_nobody(tmp_path: Path, victims: set[str]) -> None:
+    store, metrics, config = SqlStore(f"sqlite:///{tmp_path}/vipe.db"), Metrics(), _config(tmp_path)
+    agent = Agent(store, config, RayExecutor(config), metrics)
+    count = tmp_path / "count"
+    scripts = {"a": f"frames=3 count={count}", "b": f"frames=3 slow=4 count={count}", "c": f"frames=3 count={count}"}
+    job_id = _submit(store, tmp_path, scripts)
+    agent.start()
+    try:
+        _wait(lambda: count.exists() and "b-" in count.read_text(), "the second video to begin")
+        heads = [pid for pid in head_processes() if Path(f"/proc/{pid}/comm").read_text().strip() in victims]
+        assert len(heads) == len(victims)
+        for pid in heads:
+            os.kill(pid, signal.SIGKILL)
+        job = _finished(store, job_id)
+    finally:
+        agent.stop()
+        store.close()
+    assert job.state is JobState.SUCCEEDED
+    assert {row.status for row in _rows(tmp_path, job_id).values()} == {VideoStatus.SUCCEEDED}
+    tried = Counter(line.rsplit("-", 1)[0] for line in count.read_text().split())
+    assert tried == {"a": 1, "b": 2, "c": 1}
+    assert not [e for e in store.events(job_id) if e.kind == "video.blamed"]
+    assert metrics.registry.get_sample_value("vipe_executor_restarts_total") == 1
 
 
 def test_kill_9_of_the_agent_loses_and_doubles_nothing(tmp_path: Path) -> None:
