@@ -6,6 +6,7 @@ stable code, so that only a dead process looks like a dead process.
 
 from __future__ import annotations
 
+import errno
 import logging
 import resource
 import threading
@@ -57,6 +58,10 @@ class SlotConfig:
     scratch_max_age_s: float
     inputs: InputRules = field(default_factory=InputRules)
     media: Limits = field(default_factory=Limits)
+
+
+# Writing fails so where there is no room; such an error names no file. Nothing else of a video's work writes.
+_DISK_TROUBLE = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
 
 
 class _Interrupted(BaseException):
@@ -159,7 +164,8 @@ class Slot:
         except MemoryError as error:
             failure = Failed(EngineError.code, f"{video.uri}: {_one_line(error, path, video)}", retryable=True)
         except OSError as error:
-            if error.filename is None or not Path(str(error.filename)).is_relative_to(self._config.scratch_dir):
+            in_scratch = Path(str(error.filename or "/")).is_relative_to(self._config.scratch_dir)
+            if not in_scratch and error.errno not in _DISK_TROUBLE:
                 failure = _unforeseen(error, video.uri)
             else:
                 raise

@@ -2,7 +2,7 @@
 
     open -> (annotate a video)* -> pack -> commit -> discard
               | died: blame, restart, try the video again after the others of its shard
-              | over its wall budget: kill, `video_timeout`, restart
+              | over its wall budget: kill, restart, try the video once more at the end, then `video_timeout`
               | storage down: back off, then give the lease back
 
 Two coordinated caps keep one bad part from taking the rest with it. A video that kills the worker is tried last and is
@@ -202,10 +202,11 @@ class Supervisor:
         """Fill `results` until every video of the lease has one."""
         lease = live.lease
         tries: dict[str, int] = {}
+        timeouts: dict[str, int] = {}
         storage = self._backoff()
         while missing := [video for video in lease.videos if video.key not in results]:
             # Those that have killed a worker go last: the others are safe by then, and the slot has proved itself.
-            video = min(missing, key=lambda v: len(deaths.get(v.key, ())))
+            video = min(missing, key=lambda v: len(deaths.get(v.key, ())) + timeouts.get(v.key, 0))
             if self._is_poison(deaths.get(video.key, ())):
                 results[video.key] = self._quarantined(video, lease, deaths[video.key])
                 continue
@@ -243,8 +244,11 @@ class Supervisor:
                     case Failed():
                         raise self._given_back(live, answer)
                     case _TimedOut(budget_s):
-                        message = f"{video.uri}: no result within {budget_s:.0f} s; the worker was killed"
-                        results[video.key] = failed_row(video, lease.attempt, VIDEO_TIMEOUT, message)
+                        # Once it may have been the machine: a disk that hung, a process that somebody stopped.
+                        timeouts[video.key] = timeouts.get(video.key, 0) + 1
+                        if timeouts[video.key] >= self._config.max_video_tries:
+                            message = f"{video.uri}: no result within {budget_s:.0f} s; the worker was killed"
+                            results[video.key] = failed_row(video, lease.attempt, VIDEO_TIMEOUT, message)
                         self._replace(results, self._opened(live, results))
                     case Died():
                         self._died_on(live, video, answer, deaths)

@@ -6,6 +6,8 @@
     die                  the worker process dies, every time
     die-once=PATH        dies if PATH does not exist, and creates it
     hang                 never comes back
+    hang-once=PATH       the first time
+    disk-full-once=PATH  no file may become longer than 100 bytes, the first time
     slow=SECONDS         takes its time, reporting progress
     flaky=PATH           a retryable typed error, once
     leak=MIB             keeps so much memory for ever
@@ -16,7 +18,9 @@ They write real artifacts with the engine's own writer, so that everything behin
 
 from __future__ import annotations
 
+import contextlib
 import os
+import resource
 import signal
 import time
 from collections.abc import Iterator
@@ -70,7 +74,7 @@ class ScriptedEngine:
         if "die-once" in script and not Path(script["die-once"]).exists():
             Path(script["die-once"]).touch()
             self._die()
-        if "hang" in script:
+        if "hang" in script or _first_time(script.get("hang-once")):
             if not self._real_process:
                 raise ProcessHang
             time.sleep(3600)
@@ -79,7 +83,8 @@ class ScriptedEngine:
             progress("track", int(spent * 10), frames, 0.1)
             time.sleep(0.05)
         annotation = fake_annotation(video.key, frames)
-        write_artifacts(annotation, root, attributes=["pose", "intrinsics", "depth"])
+        with _short_files() if _first_time(script.get("disk-full-once")) else contextlib.nullcontext():
+            write_artifacts(annotation, root, attributes=["pose", "intrinsics", "depth"])
         progress("depth", frames, frames, 1.0)
         return index_row(annotation, video)
 
@@ -88,6 +93,23 @@ class ScriptedEngine:
             raise ProcessDeath
         os.kill(os.getpid(), signal.SIGSEGV)
         time.sleep(60)
+
+
+def _first_time(marker: str | None) -> bool:
+    if marker is None or Path(marker).exists():
+        return False
+    Path(marker).touch()
+    return True
+
+
+@contextlib.contextmanager
+def _short_files() -> Iterator[None]:
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (100, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
 
 
 def open_in_memory(preset: str, camera: str, device: str) -> ScriptedEngine:

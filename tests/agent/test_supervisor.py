@@ -119,8 +119,25 @@ def test_a_hanging_video_is_killed_after_its_budget(rig: Rig) -> None:
     rows = rig.rows(live)
     assert rows["a"].error_code == "video_timeout"
     assert rows["b"].status is VideoStatus.SUCCEEDED
-    assert rig.config.video_budget_base_s < rig.clock.now_s < rig.config.video_budget_base_s + 2
-    assert rig.metric("vipe_actor_restarts_total", reason="video_timeout") == 1
+    assert rig.slot.annotated() == ["a", "b", "a"], "once more, after the others"
+    assert 2 * rig.config.video_budget_base_s < rig.clock.now_s < 2 * rig.config.video_budget_base_s + 3
+    assert rig.metric("vipe_actor_restarts_total", reason="video_timeout") == 2
+
+
+def test_a_video_that_hung_for_the_machines_sake_succeeds_after_all(rig: Rig, tmp_path: Path) -> None:
+    rig.job({"a": f"hang-once={tmp_path / 'hung'}", "b": "frames=3"})
+    live = rig.lease()
+    assert rig.supervisor.work(live).kind == "committed"
+    assert {row.status for row in rig.rows(live).values()} == {VideoStatus.SUCCEEDED}
+
+
+def test_a_full_disk_is_no_fault_of_the_video(rig: Rig, tmp_path: Path) -> None:
+    """A limit on the size of files stands for the full disk: `write` fails and names no file in both cases."""
+    rig.job({"a": f"disk-full-once={tmp_path / 'full'}", "b": "frames=3"})
+    live = rig.lease()
+    assert rig.supervisor.work(live).kind == "committed"
+    assert {row.status for row in rig.rows(live).values()} == {VideoStatus.SUCCEEDED}
+    assert rig.slot.annotated() == ["a", "a", "b"]
 
 
 def test_a_retryable_error_gets_a_second_try(rig: Rig, tmp_path: Path) -> None:
