@@ -49,7 +49,7 @@ def test_a_job_on_a_bucket_without_conditions(
 ) -> None:
     bucket = f"c-{uuid.uuid4().hex[:12]}"
     boto3.client("s3", endpoint_url=proxy.url).create_bucket(Bucket=bucket)
-    proxy.mode = mode
+    proxy.modes[mode] = 1.0
     inputs = rig.root / "inputs"
     inputs.mkdir()
     for name in "abc":

@@ -1,321 +1,302 @@
-"""Every interleaving of two attempts, with a crash, a lost answer or a late request at every step.
+"""Every order of two attempts, the garbage collection and the reconciler, with every fault at every step.
 
-The attempts run the real protocol code. Each of their calls to the store or the lease stops at a gate; a schedule says
-who goes next, and a fault hits one attempt at one of its calls. Afterwards a third attempt runs undisturbed, as the
-service would lease a shard that is not known to be committed. Whatever happened, the shard must exist exactly once.
+Faults: crashes before and after each call, refusals (503, 409, no connection), lost answers, requests that arrive after
+everything that was sent later, requests that the client library sent twice (412 about one's own object), truncated
+uploads; leases that run out at any moment, so that their holders go on as zombies. See `protocol_model`.
 """
 
 from __future__ import annotations
 
-import contextlib
 import functools
-import hashlib
+import inspect
 import itertools
-import threading
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+import sys
+import types
+import uuid
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from protocol_model import Model, Process, Row, View, Violation
 from shard_factory import JOB, make_lease, success
 
-from services.commit import (
-    CommitOutcome,
-    PreparedPayload,
-    collect_garbage,
-    committed_records,
-    prepare_payload,
-    write_record,
-)
-from services.domain.errors import ObjectMissing, StorageError
-from services.domain.models import CommitRecord, JobSpec
-from services.storage.base import ObjectInfo
+import services.commit.gc as gc_module
+import services.commit.protocol as protocol_module
+from services.commit.layout import commit_key
+from services.commit.reconcile import committed_record
+from services.commit.tar_writer import write_tar
+from services.commit.verify import verify_tar
+from services.domain.errors import IntegrityError, StorageError
+from services.domain.models import JobSpec, Lease
 
-FAULTS = ("crash", "crash after", "refused", "answer lost", "late", "retried inside")
-
-
-class Crashed(BaseException):
-    """The process is gone: nothing of it runs any more."""
-
-
-@dataclass
-class MemoryStore:
-    """What object storage promises: single calls are atomic."""
-
-    objects: dict[str, bytes] = field(default_factory=dict)
-    late: list[Callable[[], object]] = field(default_factory=list)
-    uri: str = "memory"
-
-    def put_file(self, key: str, path: Path) -> ObjectInfo:
-        return self.put_bytes(key, path.read_bytes())
-
-    def put_bytes(self, key: str, data: bytes) -> ObjectInfo:
-        self.objects[key] = data
-        return ObjectInfo(key, len(data), None)
-
-    def create(self, key: str, data: bytes) -> bool:
-        return self.objects.setdefault(key, data) is data
-
-    def get_bytes(self, key: str, start: int = 0, length: int | None = None) -> bytes:
-        if key not in self.objects:
-            raise ObjectMissing(key)
-        return self.objects[key]
-
-    def download(self, key: str, path: Path) -> None:
-        path.write_bytes(self.get_bytes(key))
-
-    def head(self, key: str) -> ObjectInfo | None:
-        return ObjectInfo(key, len(self.objects[key]), None) if key in self.objects else None
-
-    def list(self, prefix: str = "") -> Iterator[ObjectInfo]:
-        return iter([ObjectInfo(k, len(v), None) for k, v in sorted(self.objects.items()) if k.startswith(prefix)])
-
-    def delete(self, key: str) -> None:
-        self.objects.pop(key, None)
-
-
-class Gated:
-    """One attempt's view of the store: every call waits for its turn and may meet the fault."""
-
-    def __init__(self, store: MemoryStore, fault: tuple[int, str] | None) -> None:
-        self._store, self._fault = store, fault
-        self._calls = 0
-        self._go, self._stopped = threading.Semaphore(0), threading.Semaphore(0)
-        self._thread: threading.Thread | None = None
-        self._dead = False
-        self.uri = store.uri
-        self.outcome: CommitOutcome | BaseException | None = None
-
-    def start(self, work: Callable[[Gated], CommitOutcome]) -> None:
-        def run() -> None:
-            try:
-                self.outcome = work(self)
-            except BaseException as error:  # a crash is an outcome here
-                self.outcome = error
-            self._stopped.release()
-
-        self._thread = threading.Thread(target=run)
-        self._thread.start()
-        self._stopped.acquire()
-
-    def step(self) -> bool:
-        """Let one call through; False if the attempt has ended."""
-        if self.outcome is not None:
-            return False
-        self._go.release()
-        self._stopped.acquire()
-        return True
-
-    def finish(self) -> None:
-        while self.step():
-            pass
-        assert self._thread is not None
-        self._thread.join()
-
-    def call(self, action: Callable[[], object]) -> object:
-        if self._dead:
-            raise Crashed
-        self._stopped.release()
-        self._go.acquire()
-        number, self._calls = self._calls, self._calls + 1
-        kind = self._fault[1] if self._fault and self._fault[0] == number else None
-        if kind in ("crash", "refused", "late"):
-            if kind == "late":  # the request is on its way and lands after everything else
-                self._store.late.append(action)
-            self._dead = kind == "crash"
-            raise Crashed if kind == "crash" else StorageError("no answer")
-        result = action()
-        if kind == "retried inside":  # the answer was lost and the client library sent the request again
-            return action()
-        if kind == "crash after":
-            self._dead = True
-            raise Crashed
-        if kind == "answer lost":
-            raise StorageError("no answer")
-        return result
-
-    def put_file(self, key: str, path: Path) -> object:
-        data = path.read_bytes()  # a late upload has left the disk already
-        return self.call(lambda: self._store.put_bytes(key, data))
-
-    def __getattr__(self, name: str) -> Callable[..., object]:
-        method = getattr(self._store, name)
-        return lambda *args, **kwargs: self.call(lambda: method(*args, **kwargs))
-
-
-def _lease(attempt: int):
-    lease = make_lease(["a", "b"], attempt=attempt)
-    spec = JobSpec(inputs=("/in",), output="/out", attributes=("pose", "intrinsics"))
-    return type(lease)(**{f: getattr(lease, f) for f in lease.__slots__} | {"spec": spec})
-
-
-@pytest.fixture(scope="module")
-def artifacts(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
-    """Different bytes per attempt, as a GPU that is not deterministic would make them."""
-    roots = []
-    for attempt in (1, 2, 3):
-        root = tmp_path_factory.mktemp(f"attempt{attempt}")
-        for folder, names in {"pose": ["{}.npz"], "intrinsics": ["{}.npz", "{}_camera.txt"]}.items():
-            (root / folder).mkdir()
-            for name, key in itertools.product(names, ("a", "b")):
-                (root / folder / name.format(key)).write_bytes(b"%d" % attempt)
-        roots.append(root)
-    return roots
-
-
-class Templates(list[tuple[PreparedPayload, dict[str, bytes]]]):
-    def __repr__(self) -> str:
-        return "the templates"
-
-
-@pytest.fixture(scope="module")
-def templates(artifacts: list[Path], tmp_path_factory: pytest.TempPathFactory) -> Templates:
-    """Attempts whose upload is done: to walk over the record's step exhaustively, and for the attempt at the end."""
-    made = Templates()
-    for attempt in (1, 2, 3):
-        store = MemoryStore()
-        prepared = prepare_payload(
-            _lease(attempt), _results(attempt), artifacts[attempt - 1], tmp_path_factory.mktemp("s"), store
-        )
-        made.append((prepared, dict(store.objects)))
-    return made
-
-
-def _results(attempt: int):
-    return [success("a", attempt=attempt), success("b", attempt=attempt)]
-
-
-# What the database says when an attempt asks: it has the lease, it has lost it, it loses it before it asks again.
-HOLDS = ((True, True), (False, False), (True, False))
-
-
-def _record(holds: tuple[bool, bool], prepared: PreparedPayload) -> Callable[[Gated], CommitOutcome]:
-    """The agent: an error of storage makes it ask once more."""
-
-    def work(gate: Gated) -> CommitOutcome:
-        try:
-            return write_record(gate, prepared, lambda: bool(gate.call(lambda: holds[0])))
-        except StorageError:
-            return write_record(gate, prepared, lambda: bool(gate.call(lambda: holds[1])))
-
-    return work
-
-
-def _run(gates: Sequence[Gated], works: Sequence[Callable[[Gated], CommitOutcome]], schedule: Sequence[int]) -> None:
-    for gate, work in zip(gates, works, strict=True):
-        gate.start(work)
-    for turn in schedule:
-        gates[turn].step()
-    for gate in gates:
-        gate.finish()
-
-
-_parse = functools.cache(CommitRecord.from_bytes)
+KEYS = ("a", "b")
 
 
 @functools.cache
-def _sha256(data: bytes) -> str:
-    return hashlib.sha256(data).hexdigest()
+def lease_of(attempt: int) -> Lease:
+    spec = JobSpec(inputs=("/in",), output="/out", attributes=("pose", "intrinsics"))
+    return replace(make_lease(list(KEYS), attempt=attempt), spec=spec)
 
 
-def _check(store: MemoryStore, gates: Sequence[Gated], last: tuple[PreparedPayload, dict], *, very_late: bool) -> None:
-    """The invariants: after the race, after a third attempt, after the late requests, after the garbage collection."""
+class Attempts:
+    """The agent's side of an attempt around one version of the protocol; packs and commits twice before it gives up."""
 
-    def land() -> None:
-        while store.late:
-            with contextlib.suppress(ObjectMissing):
-                store.late.pop()()
+    def __init__(self, protocol: types.ModuleType, root: Path) -> None:
+        self._protocol = protocol
+        self._root = root
+        (root / "scratch").mkdir()
+        # Every packing has other bytes, as a GPU that is not deterministic and a worker that died would make them.
+        for attempt, packing in itertools.product((1, 2, 3), (0, 1)):
+            artifacts = self._artifacts(attempt, packing)
+            for folder, names in {"pose": ["{}.npz"], "intrinsics": ["{}.npz", "{}_camera.txt"]}.items():
+                (artifacts / folder).mkdir(parents=True)
+                for name, key in itertools.product(names, KEYS):
+                    (artifacts / folder / name.format(key)).write_bytes(b"%d%d" % (attempt, packing))
 
-    def consistent() -> list[bytes]:
-        records = [store.objects[o.key] for o in store.list(f"_commits/{JOB}/")]
-        assert len(records) <= 1
-        for record in map(_parse, records):
-            assert {v.key for v in record.videos} == {"a", "b"}
-            assert all(_sha256(store.objects[o.key]) == o.sha256 for o in record.objects)
-        return records
+    def by_output(self, attempt: int) -> Callable[[View], str]:
+        lease = lease_of(attempt)
 
-    before = consistent()
-    for gate in gates:
-        if isinstance(gate.outcome, CommitOutcome) and gate.outcome.record is not None:
-            assert [gate.outcome.record.to_bytes()] == before
-        elif not isinstance(gate.outcome, CommitOutcome):
-            assert isinstance(gate.outcome, (Crashed, StorageError)), gate.outcome
-    if not very_late:
-        land()
-    existing = consistent()
-    assert existing[: len(before)] == before
-
-    prepared, objects = last
-    store.objects.update(objects)
-    outcome = write_record(store, prepared, lambda: True)
-    assert outcome.kind == ("adopted" if existing else "committed")
-    final = consistent()
-    assert len(final) == 1
-    assert not existing or final == existing
-    land()
-    assert consistent() == final
-
-    collect_garbage(store, JOB)
-    (record,) = committed_records(store, JOB)
-    assert {o.key for o in store.list("payload/")} == {o.key for o in record.objects}
-    assert consistent() == final
-
-
-def _schedules(steps: int) -> Iterator[tuple[int, ...]]:
-    """Every order of `steps` calls of either attempt; what is left then runs one attempt after the other."""
-    for first in itertools.combinations(range(2 * steps), steps):
-        yield tuple(0 if turn in first else 1 for turn in range(2 * steps))
-
-
-def test_every_interleaving_of_two_records_with_every_fault(
-    templates: Templates,
-) -> None:
-    faults: list[tuple[int, str] | None] = [None, *itertools.product(range(5), FAULTS)]
-    kinds: set[str] = set()
-    for fault, *holds in itertools.product(faults, HOLDS, HOLDS[:2]):
-        # Ask, create, read. A side without a lease writes nothing, so then the order says little.
-        schedules = list(_schedules(3))[: None if holds[1][0] else 2]
-        for number, schedule in enumerate(schedules):
-            store = MemoryStore()
-            for _, objects in templates[:2]:
-                store.objects.update(objects)
-            gates = [Gated(store, fault), Gated(store, None)]
-            _run(gates, [_record(h, t[0]) for h, t in zip(holds, templates[:2], strict=True)], schedule)
-            kinds.update(g.outcome.kind for g in gates if isinstance(g.outcome, CommitOutcome))
-            _check(store, gates, templates[2], very_late=number % 2 == 0)
-    assert kinds == {"committed", "adopted", "lost_lease"}
-
-
-@settings(max_examples=150, deadline=None)
-@given(
-    schedule=st.lists(st.integers(0, 1), max_size=24),
-    faults=st.tuples(*[st.none() | st.tuples(st.integers(0, 9), st.sampled_from(FAULTS))] * 2),
-    holds=st.tuples(st.sampled_from(HOLDS), st.sampled_from(HOLDS)),
-    very_late=st.booleans(),
-)
-def test_two_whole_attempts_with_faults_on_both_sides(
-    artifacts: list[Path],
-    templates: Templates,
-    tmp_path_factory: pytest.TempPathFactory,
-    schedule: list[int],
-    faults: tuple[tuple[int, str] | None, ...],
-    holds: tuple[tuple[bool, bool], ...],
-    very_late: bool,
-) -> None:
-    scratch = tmp_path_factory.mktemp("scratch")
-
-    def whole(attempt: int) -> Callable[[Gated], CommitOutcome]:
-        def work(gate: Gated) -> CommitOutcome:
-            prepared = prepare_payload(
-                _lease(attempt), _results(attempt), artifacts[attempt - 1], scratch / str(attempt), gate
+        def run(view: View) -> str:
+            if attempt > 1 and (found := committed_record(view, JOB, lease.shard_id)) is not None:  # type: ignore[arg-type]
+                view.record_commit(found)
+                return "found"
+            prepared = self._prepared(view, attempt, lambda: None)
+            return self._committed(
+                view, lambda: self._protocol.write_record(view, prepared, lambda: view.holds(lease.fence))
             )
-            return _record(holds[attempt - 1], prepared)(gate)
 
-        return work
+        return run
 
-    store = MemoryStore()
-    gates = [Gated(store, fault) for fault in faults]
-    _run(gates, [whole(1), whole(2)], schedule)
-    _check(store, gates, templates[2], very_late=very_late)
+    def by_database(self, attempt: int) -> Callable[[View], str]:
+        lease = lease_of(attempt)
+
+        def run(view: View) -> str:
+            if attempt > 1:
+                key = commit_key(JOB, lease.shard_id)
+                if (decided := view.decided()) is not None and view.head(key) is None:
+                    view.put_bytes(key, decided)
+                if (found := committed_record(view, JOB, lease.shard_id)) is not None:  # type: ignore[arg-type]
+                    view.record_commit(found)
+                    return "found"
+            names = tuple(self._protocol.tar_names(lease)[:4])
+            prepared = self._prepared(view, attempt, lambda: view.take_name(names))
+            return self._committed(view, lambda: self._protocol.write_decided(view, prepared, view.decide))
+
+        return run
+
+    def _prepared(self, view: View, attempt: int, name: Callable[[], str | None]):  # type: ignore[no-untyped-def]
+        lease = lease_of(attempt)
+        results = [success(key, attempt=attempt) for key in KEYS]
+        nonces = itertools.count()
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(uuid, "uuid4", lambda: types.SimpleNamespace(hex=f"{attempt}-{next(nonces)}"))
+            for packing in (0, 1):
+                try:
+                    return self._protocol.prepare_payload(
+                        lease,
+                        results,
+                        self._artifacts(attempt, packing),
+                        self._root / "scratch",
+                        view,
+                        tar_name=name(),
+                    )
+                except (StorageError, IntegrityError):
+                    if packing:
+                        raise StorageError("given back") from None
+        raise AssertionError
+
+    @staticmethod
+    def _committed(view: View, write: Callable[[], object]) -> str:
+        for last in (False, True):
+            try:
+                outcome = write()
+            except StorageError:
+                if last:
+                    raise
+            else:
+                if outcome.record is not None:  # type: ignore[attr-defined]
+                    view.record_commit(outcome.record)  # type: ignore[attr-defined]
+                return str(outcome.kind)  # type: ignore[attr-defined]
+        raise AssertionError
+
+    def _artifacts(self, attempt: int, packing: int) -> Path:
+        return self._root / f"artifacts-{attempt}-{packing}"
+
+
+def reconcile(view: View) -> str:
+    found = committed_record(view, JOB, lease_of(1).shard_id)  # type: ignore[arg-type]
+    if found is not None:
+        view.record_commit(found)
+    return "reconciled"
+
+
+def collector(gc: types.ModuleType) -> Callable[[View], str]:
+    def run(view: View) -> str:
+        gc.collect_garbage(view, JOB)
+        return "collected"
+
+    return run
+
+
+@pytest.fixture
+def attempts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[types.ModuleType], Attempts]:
+    """Tars are built once for each packing: a model runs the code some ten thousand times."""
+    built: dict[tuple[str, str], bytes] = {}
+
+    def write(path: Path, samples):  # type: ignore[no-untyped-def]
+        files = list(samples)
+        key = (str(files[0][0][1].parent.parent), path.name)
+        if key not in built:
+            tar = write_tar(path, files)
+            built[key] = path.read_bytes(), tar  # type: ignore[assignment]
+        data, tar = built[key]  # type: ignore[misc]
+        path.write_bytes(data)
+        return replace(tar, path=path)
+
+    verified: dict[str, object] = {}
+
+    def verify(tar, attribute, keys):  # type: ignore[no-untyped-def]
+        if tar.sha256 not in verified:
+            verified[tar.sha256] = verify_tar(tar, attribute, keys)
+        return verified[tar.sha256]
+
+    def around(protocol: types.ModuleType) -> Attempts:
+        monkeypatch.setattr(protocol, "write_tar", write)
+        monkeypatch.setattr(protocol, "verify_tar", verify)
+        return Attempts(protocol, tmp_path)
+
+    return around
+
+
+def last_attempt(made: Attempts, code: Callable[[View], str]):  # type: ignore[no-untyped-def]
+    """The attempt that ends it: undisturbed, and then the garbage collection; what is there after them."""
+    model = Model((Process(code, 3), Process(collector(gc_module))), 0, lambda objects, row: (objects, b""))
+
+    def run(objects: dict[str, bytes], row: Row) -> tuple[dict[str, bytes], bytes]:
+        from protocol_model import _apply
+
+        now, row = frozenset(objects.items()), replace(row, fence=3)
+        for number in (0, 1):
+            history: tuple[object, ...] = ()
+            while (call := model._next(number, history)[0]) is not None:
+                now, row, answer = _apply(now, row, call)
+                history = (*history, answer)
+            outcome = model._next(number, history)[1]
+            assert isinstance(outcome, str), f"the last attempt failed: {outcome!r}"
+        assert row.committed is not None, "the database does not know of the commit"
+        after = dict(now)
+        referenced = {o.key for o in protocol_module.read_record(row.committed, "").objects}
+        assert {key for key in after if key.startswith("payload/")} == referenced, "rubbish is left"
+        return after, row.committed
+
+    return run
+
+
+def explore(made: Attempts, mode: str, *, faults: int, beside: tuple[Callable[[View], str], ...] = ()) -> Model:
+    code = made.by_output if mode == "output" else made.by_database
+    processes = (Process(code(1)), Process(code(2), 2), *(Process(each) for each in beside))
+    model = Model(processes, faults, last_attempt(made, code(3)))
+    model.check()
+    return model
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("mode", ["output", "database"])
+def test_two_attempts_with_two_faults_anywhere(attempts, mode: str) -> None:  # type: ignore[no-untyped-def]
+    model = explore(attempts(protocol_module), mode, faults=2)
+    expected = {"committed", "adopted", "found", "lost_lease", "StorageError"}
+    assert model.outcomes == expected
+    assert model.states > 10_000
+
+
+@pytest.mark.parametrize("mode", ["output", "database"])
+@pytest.mark.parametrize(
+    ("beside", "ended"),
+    [
+        ((collector(gc_module),), {"collected"}),
+        ((reconcile,), {"reconciled"}),
+        pytest.param((collector(gc_module), reconcile), {"collected", "reconciled"}, marks=pytest.mark.slow),
+    ],
+    ids=["collector", "reconciler", "both"],
+)
+def test_garbage_collection_and_reconciler_at_any_moment(  # type: ignore[no-untyped-def]
+    attempts, mode: str, beside: tuple[Callable[[View], str], ...], ended: set[str]
+) -> None:
+    model = explore(attempts(protocol_module), mode, faults=1, beside=beside)
+    assert ended <= model.outcomes
+
+
+# What breaks the protocol, and how it is found out.
+MUTANTS = {
+    "412 is taken for success": (
+        "protocol",
+        '        if store.create(key, data):\n            return CommitOutcome("committed", record)\n',
+        '        store.create(key, data)\n        return CommitOutcome("committed", record)\n',
+    ),
+    "the record replaces what is there": (
+        "protocol",
+        "        if store.create(key, data):\n",
+        "        if store.put_bytes(key, data):\n",
+    ),
+    "the payload goes when the answer is lost": (
+        "protocol",
+        "        if _read(store, key) != data:\n            raise\n",
+        "        if _read(store, key) != data:\n"
+        "            _discard(store, [o.key for o in record.objects])\n            raise\n",
+    ),
+    "tar names are used again": (
+        "protocol",
+        "        if store.create(claim_key(name), data) or _read(store, claim_key(name)) == data:\n",
+        "        if store.create(claim_key(name), data) or True:\n",
+    ),
+    "the size of an upload is not looked at": (
+        "protocol",
+        "                    if info.size_bytes != tar.size_bytes:\n",
+        "                    if False:\n",
+    ),
+    "the fence is skipped": ("protocol", "    if not holds():\n", "    if False:\n"),
+    "the loser deletes the winner's": (
+        "protocol",
+        "    _discard(store, [o.key for o in mine.objects if o.key not in referenced])\n",
+        "    _discard(store, [o.key for o in winner.objects])\n",
+    ),
+    "rubbish is what has no record yet": (
+        "gc",
+        "        if claimed[1] not in settled and not abandoned:\n",
+        "        if False:\n",
+    ),
+    "the database is asked after the record is written": (
+        "database",
+        "    counts = decide(record)\n",
+        "    store.put_bytes(key, record.to_bytes())\n    counts = decide(record)\n",
+    ),
+    "nobody looks at what the database decided": (
+        "database",
+        "    store.put_bytes(key, counts)  # Only",
+        "    store.put_bytes(key, record.to_bytes())  # Only",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", MUTANTS)
+def test_a_protocol_that_is_broken_is_found_out(attempts, name: str) -> None:  # type: ignore[no-untyped-def]
+    where, old, new = MUTANTS[name]
+    module = gc_module if where == "gc" else protocol_module
+    mutant = _mutated(module, old, new)
+    made = attempts(protocol_module if where == "gc" else mutant)
+    beside = (collector(mutant if where == "gc" else gc_module),)
+    with pytest.raises(Violation):
+        explore(made, "database" if where == "database" else "output", faults=1, beside=beside)
+
+
+def _mutated(module: types.ModuleType, old: str, new: str) -> types.ModuleType:
+    source = inspect.getsource(module)
+    assert source.count(old) == 1, "the protocol changed: change the mutant, too"
+    mutant = types.ModuleType(f"{module.__name__}_mutant")
+    sys.modules[mutant.__name__] = mutant  # Dataclasses look themselves up there.
+    try:
+        exec(compile(source.replace(old, new), module.__file__ or "", "exec"), mutant.__dict__)
+    finally:
+        del sys.modules[mutant.__name__]
+    return mutant

@@ -32,7 +32,7 @@ def store(proxy: S3Proxy) -> S3Store:
 
 @pytest.mark.parametrize("mode", ["strip", "not-implemented", "bad-request", "races"])
 def test_a_bucket_that_cannot_decide_is_found_out(proxy: S3Proxy, store: S3Store, mode: str) -> None:
-    proxy.mode = mode
+    proxy.modes[mode] = 1.0
     assert not supports_create_once(store)
     assert proxy.befallen > 0
     assert list(store.list()) == []
@@ -45,14 +45,14 @@ def test_a_bucket_that_can_decide_passes(store: S3Store) -> None:
 
 @pytest.mark.parametrize("mode", ["not-implemented", "bad-request"])
 def test_a_refused_condition_is_typed(proxy: S3Proxy, store: S3Store, mode: str) -> None:
-    proxy.mode = mode
+    proxy.modes[mode] = 1.0
     with pytest.raises(ConditionUnsupported, match="If-None-Match"):
         store.create("k", b"x")
 
 
 @pytest.mark.parametrize("mode", ["down", "refused"])
 def test_a_bucket_that_does_not_answer_is_no_answer(proxy: S3Proxy, store: S3Store, mode: str) -> None:
-    proxy.mode = mode
+    proxy.modes[mode] = 1.0
     with pytest.raises(StorageError) as caught:
         supports_create_once(store)
     assert caught.value.retryable
