@@ -1,8 +1,7 @@
 """An S3 endpoint that misbehaves on request: a proxy in front of a real one.
 
-Modes, changed while it runs:
+Modes, switched on and off while it runs:
 
-    pass        what the service behind it does
     down        503 for everything
     refused     the connection is closed without an answer, and nothing reaches the service
     lost        the request reaches the service, its answer does not reach the client
@@ -23,7 +22,8 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any
 from urllib.parse import urlsplit
 
-MODES = ("pass", "down", "refused", "lost", "slow", "truncated", "strip", "not-implemented", "bad-request", "races")
+MODES = ("down", "refused", "truncated", "lost", "slow", "strip", "not-implemented", "bad-request", "races")
+_ABOUT_CONDITIONS = {"strip", "not-implemented", "bad-request", "races"}
 _CONDITION = "If-None-Match"
 _HOP_BY_HOP = {"connection", "keep-alive", "transfer-encoding", "host", "expect"}
 
@@ -32,8 +32,8 @@ class S3Proxy:
     """Listens on a port of its own from `start` until `stop`.
 
     Attributes:
-        mode: One of `MODES`.
-        share: Share of the requests that the mode befalls, 0..1; the modes about conditions befall all.
+        modes: Each of `MODES` that is on, and the share of the requests that it befalls, 0..1; those about conditions
+            befall all. The first that applies to a request counts, in the order of `MODES`.
         slow_s: Delay of the mode `slow`, and of the write in the mode `races`.
         befallen: Requests that a mode changed.
     """
@@ -41,8 +41,7 @@ class S3Proxy:
     def __init__(self, upstream: str, *, seed: int = 0) -> None:
         parts = urlsplit(upstream)
         self._upstream = (str(parts.hostname), parts.port or 80)
-        self.mode = "pass"
-        self.share = 1.0
+        self.modes: dict[str, float] = {}
         self.slow_s = 0.05
         self.befallen = 0
         self._random = random.Random(seed)
@@ -66,16 +65,16 @@ class S3Proxy:
 
     def befalls(self, method: str, headers: dict[str, str]) -> str:
         """The mode that applies to one request."""
-        mode = self.mode
         conditional = method == "PUT" and _CONDITION in headers
-        if mode in ("strip", "not-implemented", "bad-request", "races"):
-            applies = conditional
-        elif mode == "truncated":
-            applies = method == "PUT" and self._random.random() < self.share
-        else:
-            applies = mode != "pass" and self._random.random() < self.share
-        self.befallen += applies
-        return mode if applies else "pass"
+        for mode, share in sorted(self.modes.items(), key=lambda item: MODES.index(item[0])):
+            if mode in _ABOUT_CONDITIONS:
+                applies = conditional
+            else:
+                applies = (mode != "truncated" or method == "PUT") and self._random.random() < share
+            if applies:
+                self.befallen += 1
+                return mode
+        return "pass"
 
     def forward(self, method: str, path: str, headers: dict[str, str], body: bytes) -> tuple[int, Any, bytes]:
         """(status, headers, body) of the service behind."""
