@@ -94,9 +94,10 @@ def confirm(
     believed = agreed & (votes >= np.where(moving, _SURE_VOTES, np.where(raw.score > _SURE_SCORE, 1, _MIN_VOTES)))
     believed = _without_specks(value, believed)
     score = np.clip((raw.score - _MIN_SCORE) / (_SURE_SCORE - _MIN_SCORE), 0, 1)
-    distinct = np.clip(raw.margin / _SURE_MARGIN, _LEAST_DISTINCT, 1)
-    belief = np.where(believed, share * score * distinct, 0).astype(np.float32)
+    distinct = np.clip(raw.margin / _SURE_MARGIN, 0, 1)
+    belief = np.where(believed, share * score * np.maximum(distinct, _LEAST_DISTINCT), 0).astype(np.float32)
     belief[belief < _MIN_BELIEF] = 0
+    # Nobody can be asked about an answer that is far too near, either: without a margin it counts for nothing.
     alone = (asked == 0) & ~moving
     weight = np.where(alone, _LONE_BELIEF * score * distinct, belief) ** 2
     return Confirmed((value * (1 + ratios) / (1 + votes)).astype(np.float32), belief, weight.astype(np.float32), moving)

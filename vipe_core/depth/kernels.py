@@ -213,7 +213,8 @@ def sweep_cost(
     """Matching cost of every pixel for the inverse depths `base + offsets[k] * step`.
 
     The cost is 1 minus the zero-mean normalised cross-correlation of adaptive support windows, averaged over the better
-    half of the sources that see the window: what is hidden in one direction is usually visible in another.
+    half of the sources: what is hidden in one direction is usually visible in another. A source that does not see the
+    window says nothing, a correlation of 0; the best of fewer would look better, and the fewest see what is very near.
 
     Args:
         reference: (h, w) float32 gray.
@@ -258,16 +259,17 @@ def sweep_cost(
                 _warp(image, turned, t, base, step, offsets[k], model, params, inner)
         _correlate(weights, products, statistics[0], gain, warped, radius, stride, noise, first, second, count)
     cost = np.empty((h, w, num_planes), np.float32)
-    half = np.float32(0.5)
+    half, zero = np.float32(0.5), np.float32(0)
     for y in range(h):
         for k in range(num_planes):
             for x in range(w):
                 if count[k, y, x] == 0:
                     cost[y, x, k] = _FAR_COST
-                elif count[k, y, x] <= 2:
+                elif num_sources <= 2:
                     cost[y, x, k] = 1 - first[k, y, x]
                 else:
-                    cost[y, x, k] = 1 - half * (first[k, y, x] + second[k, y, x])
+                    other = second[k, y, x] if count[k, y, x] > 1 else zero
+                    cost[y, x, k] = 1 - half * (first[k, y, x] + other)
     return cost
 
 
