@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -25,6 +26,10 @@ _UPSAMPLE_SAME = 0.1
 # many times nearer, for things that adjustment could not place.
 _FARTHER_STEPS = 4
 _NEARER, _STEP_GROWTH = 2.5, 1.06
+# The coarse windows carry the depth of a thing so many pixels (at half of the working size) beyond its border. What is
+# further behind than this share is another surface; it must correlate better by so much.
+_RIM_PX, _OTHER_SURFACE, _BETTER = 4, 0.1, 0.02
+_TRIAL = np.linspace(-1, 1, 5, dtype=np.float32)
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,8 +121,10 @@ class PlaneSweep:
         fine_gray = half.astype(np.float32)
         coarse = np.maximum(coarse, np.float32(0.05 * prior.low))
         depth, _ = upsample(coarse, np.clip(1 - raw, 0, 1), gray, half, _UPSAMPLE_EDGE, _UPSAMPLE_SAME)
-        base = 1 / depth
         step = cv2.resize(reach, (width, height), interpolation=cv2.INTER_LINEAR)
+        base = self._trimmed(
+            1 / depth, lambda d: cost_of(self.fine, fine_gray, d, step, _TRIAL, images, settings.fine_radius)
+        )
         offsets = np.linspace(-1, 1, settings.fine_planes, dtype=np.float32)
         cost = cost_of(self.fine, fine_gray, base, step, offsets, images, settings.fine_radius)
         position, raw, _ = winner(self._aggregated(cost, fine_gray), cost)
@@ -129,6 +136,17 @@ class PlaneSweep:
         at_end = (plane > len(planes) - 2).astype(np.uint8)
         score[cv2.resize(at_end, (width, height), interpolation=cv2.INTER_NEAREST) > 0] = 0
         return RawDepth(found, score, np.asarray(sure, np.float32), True)
+
+    def _trimmed(self, inverse_depth: Array, cost_at: Callable[[Array], Array]) -> NDArray[np.float32]:
+        """Things without the rim that the windows of the coarse sweep gave them: what lies beside them is tried there."""
+        side = 2 * _RIM_PX + 1
+        behind = cv2.erode(inverse_depth, np.ones((side, side), np.uint8))
+        rim = behind < (1 - _OTHER_SURFACE) * inverse_depth
+        if not rim.any():
+            return np.asarray(inverse_depth, np.float32)
+        here, there = (cost_at(d).min(axis=2) for d in (inverse_depth, np.where(rim, behind, inverse_depth)))
+        better = cv2.blur(np.where(rim, here - there, 0).astype(np.float32), (3, 3)) > _BETTER
+        return np.where(rim & better, behind, inverse_depth).astype(np.float32)
 
     def _aggregated(self, cost: Array, gray: Array) -> Array:
         s = self._settings
