@@ -12,6 +12,8 @@ from vipe_core.errors import FormatError
 from vipe_core.formats.frame_zip import FrameZipReader, FrameZipWriter
 
 _PNG_LEVEL = 3
+# What is filled in has no more confidence than this, what is measured no less.
+_FILLED_CONFIDENCE = 0.05
 
 
 class MaskZipWriter(FrameZipWriter):
@@ -45,13 +47,19 @@ class KindZipReader(MaskZipReader):
 
 
 class ConfidenceZipWriter(FrameZipWriter):
-    """Appends (H, W) confidence in 0..1, in steps of 1/255; what is not 0 stays above 0."""
+    """Appends (H, W) confidence in 0..1; what is not 0 stays above 0.
+
+    It is known to a tenth or so: steps of 1/15 take a third of the bytes that steps of 1/255 would. Up to 0.05, which
+    is of what is filled in, the steps are 4/255.
+    """
 
     suffix = "png"
 
     def _encoded(self, picture: NDArray[Any]) -> bytes:
-        steps = np.clip(np.rint(picture * np.float32(255)), 0, 255)
-        return _png(np.where(picture > 0, np.maximum(steps, 1), 0).astype(np.uint8))
+        low = np.maximum(np.rint(picture * np.float32(255 / 4)) * 4, 1)
+        high = np.maximum(np.rint(picture * np.float32(15)), 1) * 17
+        steps = np.where(picture > _FILLED_CONFIDENCE, high, np.where(picture > 0, low, 0))
+        return _png(np.clip(steps, 0, 255).astype(np.uint8), cv2.IMWRITE_PNG_STRATEGY_RLE)
 
 
 class ConfidenceZipReader(FrameZipReader[np.float32]):
@@ -65,8 +73,9 @@ class ConfidenceZipReader(FrameZipReader[np.float32]):
         return _picture(data, label) * np.float32(1 / 255)
 
 
-def _png(picture: NDArray[Any]) -> bytes:
-    _, data = cv2.imencode(".png", picture, [cv2.IMWRITE_PNG_COMPRESSION, _PNG_LEVEL])
+def _png(picture: NDArray[Any], strategy: int = cv2.IMWRITE_PNG_STRATEGY_DEFAULT) -> bytes:
+    how = [cv2.IMWRITE_PNG_COMPRESSION, _PNG_LEVEL, cv2.IMWRITE_PNG_STRATEGY, strategy]
+    _, data = cv2.imencode(".png", picture, how)
     return data.tobytes()
 
 
