@@ -9,6 +9,8 @@ them, at the same scale. `depth/pose` is that scale over the scale of the path: 
 that no mask holds. CPU-seconds are of the depth stage, decoders included. Below: the mean error of the tenths of the
 pixels by rising confidence. Beside it, on the same frames with the same poses: OpenCV's semi-global stereo matcher on
 rectified pairs (of the frames that can be rectified), and the inverse depth of the nearest keyframes, interpolated.
+The depth sensor of sevenscenes is not registered to its pictures: its pixels are compared with what lies in their
+directions.
 
 With --memory, the pictures of a sequence are played forth and back at 320 pixels' width, to 200 and to 2,000 frames:
 what the depth stage holds at most must not depend on it.
@@ -51,10 +53,9 @@ from vipe_core.evaluation.metrics import (
     convert_depth,
     depth_errors,
     depth_pose_scale_ratio,
-    sample_depth,
     trajectory_errors,
 )
-from vipe_core.evaluation.truth import GroundTruth, read_truth
+from vipe_core.evaluation.truth import GroundTruth, read_truth, sample_at_truth
 from vipe_core.pipeline.annotator import Annotator
 from vipe_core.priors.classical import classical_priors
 from vipe_core.slam.system import Slam
@@ -209,10 +210,12 @@ def collect(sequence: BenchSequence, truth: GroundTruth, scene: SceneMap, settin
             static = np.ones(true.shape, np.bool_) if truth.dynamic is None else ~truth.dynamic[row]
             height, width = true.shape
 
-            def sampled(depth: Array, shape: tuple[int, int] = (height, width)) -> NDArray[np.float32]:
+            def sampled(depth: Array) -> NDArray[np.float32]:
                 lens = scene.camera if truth.camera is None else truth.camera
                 kind: DepthKind = "z" if scene.camera.model == "pinhole" else "ray"
-                return convert_depth(sample_depth(depth, *shape), lens, kind, truth.depth_kind)
+                return convert_depth(
+                    sample_at_truth(np.asarray(depth, np.float32), truth), lens, kind, truth.depth_kind
+                )
 
             out.ours.append((sampled(frame.depth), true, static))
             out.confidence.append(cv2.resize(frame.confidence, (width, height), interpolation=cv2.INTER_AREA))

@@ -26,6 +26,7 @@ from vipe_core.evaluation.metrics import (
     trajectory_errors,
     z_from_ray,
 )
+from vipe_core.evaluation.truth import GroundTruth, sample_at_truth
 
 CAMERAS = {
     "pinhole": Camera("pinhole", (210.0, 212.0, 128.0, 96.0), 256, 192),
@@ -161,6 +162,19 @@ def test_depth_resampling_is_exact_on_planes_and_ignores_holes() -> None:
     holed = plane.copy()
     holed[1, 1] = 0
     assert sample_depth(holed, 12, 16)[0, 0] == pytest.approx(exact[0, 0], rel=0.02)
+
+
+def test_a_sensor_beside_the_camera_is_compared_along_its_own_directions() -> None:
+    camera, sensor = Camera.pinhole_from_fov(60, 64, 48), Camera.pinhole_from_fov(50, 64, 48)
+    planes = [
+        (1 / (lens.resized(width, height).rays() @ (0.1, 0.05, 0.4))).astype(np.float32)
+        for lens, width, height in ((camera, 256, 192), (sensor, 32, 24))
+    ]
+    poses, index = np.eye(4)[None], np.zeros(1, np.int64)
+    truth = GroundTruth(poses, index, camera, planes[1][None], "z", None, sensor)
+    np.testing.assert_allclose(sample_at_truth(planes[0], truth), planes[1], rtol=0.01)
+    registered = GroundTruth(poses, index, camera, planes[1][None], "z", None)
+    assert np.abs(sample_at_truth(planes[0], registered) / planes[1] - 1).max() > 0.02
 
 
 @pytest.mark.parametrize("kind", ["pinhole", "mei"])

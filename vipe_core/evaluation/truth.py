@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -59,6 +60,8 @@ class GroundTruth:
         camera: None where the dataset publishes no calibration of the pictures.
         depth: N maps of kind `depth_kind`, 0 where unknown, on any grid over the picture; None where there are none.
         dynamic: (N, h, w) bool, true on pixels that move by themselves; None where the dataset does not say.
+        depth_camera: Of a depth sensor beside the camera, where its maps are not registered to the pictures; None where
+            they are.
     """
 
     world_from_cam: NDArray[np.float64]
@@ -67,6 +70,7 @@ class GroundTruth:
     depth: DepthFrames | None
     depth_kind: DepthKind
     dynamic: NDArray[np.bool_] | None
+    depth_camera: Camera | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -125,6 +129,10 @@ def read_truth(path: str | Path) -> GroundTruth:
         poses = values["cam_to_world"].astype(np.float64)
         params = () if model == "equirect" else tuple(float(x) for x in values["intrinsics"])
         camera = Camera(model, params, int(values["width"]), int(values["height"]))
+        sensor = values.get("shipped_intrinsics")
+        depth_camera = (
+            None if sensor is None else Camera("pinhole", tuple(map(float, sensor)), camera.width, camera.height)
+        )
         depth = values.get("depth")
         kind = _KINDS[str(values.get("depth_kind", "z"))]
     except FileNotFoundError as error:
@@ -132,7 +140,26 @@ def read_truth(path: str | Path) -> GroundTruth:
     except (KeyError, OSError, ValueError, EOFError, zipfile.BadZipFile, ConfigError) as error:
         raise FormatError(f"{path.parent.name}/{path.name}: not a readable ground truth file ({error})") from error
     index = values.get("frame_index", np.arange(len(poses))).astype(np.int64)
-    return GroundTruth(poses, index, camera, depth, kind, values.get("dynamic"))
+    return GroundTruth(poses, index, camera, depth, kind, values.get("dynamic"), depth_camera)
+
+
+def sample_at_truth(depth: NDArray[np.float32], truth: GroundTruth) -> NDArray[np.float32]:
+    """(h, w) a depth map of a picture, at the pixels of the true depth maps; 0 outside of the picture.
+
+    The pixels of a depth sensor that looks beside the camera see what lies in their directions; the few centimetres
+    between the two are left out.
+    """
+    assert truth.depth is not None
+    height, width = truth.depth.shape[1:]
+    if truth.depth_camera is None or truth.camera is None:
+        return sample_depth(depth, height, width)
+    camera = truth.camera.resized(depth.shape[1], depth.shape[0])
+    px, imaged = camera.project(truth.depth_camera.resized(width, height).rays())
+    at = np.where(imaged[..., None], px, -10).astype(np.float32)
+    known = np.isfinite(depth) & (depth > 0)
+    inverse = np.where(known, 1 / np.where(known, depth, 1), 0).astype(np.float32)
+    found = cv2.remap(inverse, at[..., 0], at[..., 1], cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT)
+    return np.where(found > 0, 1 / np.where(found > 0, found, 1), 0).astype(np.float32)
 
 
 def evaluate(
@@ -252,14 +279,13 @@ def _depth_pairs(
 ) -> Iterator[tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_]]]:
     assert truth.depth is not None
     true_row = dict(rows.tolist())
-    shape = truth.depth.shape[1:]
     step = _pixel_step(truth.depth, len(rows))
     # The estimate's kind is made the truth's with the true camera: its error is judged apart.
     lens = camera if truth.camera is None else truth.camera
     for k, depth in enumerate(maps):
         if k not in true_row:
             continue
-        sampled = convert_depth(sample_depth(depth, *shape), lens, estimate.depth_kind, truth.depth_kind)
+        sampled = convert_depth(sample_at_truth(depth, truth), lens, estimate.depth_kind, truth.depth_kind)
         yield sampled[::step, ::step], *_true_depth(truth, true_row[k], step)
 
 
