@@ -33,7 +33,9 @@ class JobRequest(BaseModel):
     )
     output: Address = Field(description="A directory or `s3://bucket/prefix` that belongs to this job alone.")
     preset: Annotated[str, AfterValidator(lambda v: offer.one_of(v, offer.presets()))] = Field(
-        default="classical", max_length=64, description="Engine preset."
+        default="classical",
+        max_length=64,
+        description="Engine preset: `classical`, or `classical_fast` with coarser dense depth for less time.",
     )
     camera: Annotated[str, AfterValidator(lambda v: offer.one_of(v, offer.cameras()))] = Field(
         default="pinhole", max_length=64, description="Camera model."

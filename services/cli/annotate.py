@@ -23,7 +23,7 @@ def annotate(
             "-o", "--output", metavar="OUT", help="Gets pose/, intrinsics/, depth/, rgb/, mask/, confidence/."
         ),
     ],
-    preset: Annotated[str, typer.Option(help="Which components do the work.")] = "classical",
+    preset: Annotated[str, typer.Option(help="classical, or classical_fast: coarser dense depth.")] = "classical",
     camera: Annotated[str, typer.Option(help="Camera model.")] = "pinhole",
     device: Annotated[str, typer.Option(help="cpu or cuda.")] = "cpu",
     masks: Annotated[

@@ -43,7 +43,9 @@ def evaluate(
     max_frames: Annotated[
         int | None, typer.Option(min=2, help="Only the first so many frames.", rich_help_panel=_RAW)
     ] = None,
-    preset: Annotated[str, typer.Option(help="Which components do the work.", rich_help_panel=_HOW)] = "classical",
+    preset: Annotated[
+        str, typer.Option(help="classical, or classical_fast: coarser dense depth.", rich_help_panel=_HOW)
+    ] = "classical",
     device: Annotated[str, typer.Option(help="cpu or cuda.", rich_help_panel=_HOW)] = "cpu",
     jobs: Annotated[int, typer.Option(min=1, help="Sequences at a time.", rich_help_panel=_HOW)] = 1,
     ablate: Annotated[

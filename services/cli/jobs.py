@@ -36,7 +36,7 @@ def submit(
     output: Annotated[
         str, typer.Option("-o", "--output", metavar="OUT", help="Directory or s3://bucket/prefix of this job.")
     ],
-    preset: str = "classical",
+    preset: Annotated[str, typer.Option(help="classical, or classical_fast: coarser dense depth.")] = "classical",
     camera: str = "pinhole",
     name: str = "",
     scale_from: Annotated[

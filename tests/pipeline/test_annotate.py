@@ -6,6 +6,7 @@ import os
 import subprocess
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -15,6 +16,7 @@ from numpy.typing import NDArray
 
 import vipe_core
 from vipe_core.annotation import Annotation, Progress
+from vipe_core.depth.types import DepthSettings
 from vipe_core.errors import ConfigError, EmptyMedia, EngineError
 from vipe_core.evaluation.synthetic.clip import ClipKind, SyntheticClip, tiny_clip
 from vipe_core.geometry import umeyama
@@ -175,6 +177,13 @@ def test_config_hash_follows_the_settings() -> None:
     slower = Preset(**{name: getattr(preset, name) for name in preset.__slots__ if name != "name"}, name="slower")
     assert slower.config_hash != preset.config_hash
     assert preset.name in PRESETS
+
+
+def test_the_fast_preset_differs_in_dense_depth_alone() -> None:
+    default, fast = resolve("classical"), resolve("classical_fast")
+    assert (default.name, fast.name) == PRESETS
+    assert fast.dense_depth == DepthSettings.fast() != default.dense_depth
+    assert replace(fast, name=default.name, dense_depth=default.dense_depth) == default
 
 
 def test_importing_the_video_package_leaves_torch_alone() -> None:

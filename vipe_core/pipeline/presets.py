@@ -61,18 +61,24 @@ class Preset:
         }
 
 
+_CLASSICAL = Preset(
+    name="classical",
+    camera="pinhole",
+    matcher="classical.dis_flow",
+    sparse="classical.lucas_kanade",
+    intrinsics="classical.two_view_focal",
+    depth="classical.plane_sweep",
+)
 _PRESETS = {
-    "classical": Preset(
-        name="classical",
-        camera="pinhole",
-        matcher="classical.dis_flow",
-        sparse="classical.lucas_kanade",
-        intrinsics="classical.two_view_focal",
-        depth="classical.plane_sweep",
+    preset.name: preset
+    for preset in (
+        _CLASSICAL,
+        dataclasses.replace(_CLASSICAL, name="classical_fast", dense_depth=DepthSettings.fast()),
     )
 }
 
 PRESETS = tuple(_PRESETS)
+"""Names, the default first. `classical_fast` has the same poses and map, and coarser dense depth for less time."""
 
 
 def resolve(preset: str | Preset, camera: str = "pinhole") -> Preset:
