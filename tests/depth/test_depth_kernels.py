@@ -11,7 +11,7 @@ from vipe_core.cameras import Camera
 from vipe_core.depth.aggregation import aggregate, winner
 from vipe_core.depth.geometry import View
 from vipe_core.depth.kernels import check, sweep_cost
-from vipe_core.depth.sweep import hypotheses
+from vipe_core.depth.sweep import hypotheses, trimmed
 from vipe_core.depth.upsampling import upsample
 
 
@@ -111,6 +111,16 @@ def test_what_must_not_be_used_has_no_say() -> None:
     assert (nothing == 1).all()
 
 
+def test_what_only_one_of_four_sources_sees_is_not_better_for_it() -> None:
+    view, reference, source, translation = moved_by_three()
+    unseen = np.full_like(source, np.nan)
+    all_see = cost_of(view, reference, np.stack([source] * 4), translation)
+    one_sees = cost_of(view, reference, np.stack([source, unseen, unseen, unseen]), translation)
+    inside = (slice(2, -2), slice(6, -3), 1)
+    assert all_see[inside].max() < 1e-3
+    np.testing.assert_allclose(one_sees[inside], 0.5, atol=1e-3)
+
+
 def test_a_window_does_not_reach_over_an_edge() -> None:
     """Left of the edge the source shows the same, right of it something else: an adaptive window hardly cares."""
     view, reference, source, translation = moved_by_three()
@@ -121,6 +131,19 @@ def test_a_window_does_not_reach_over_an_edge() -> None:
     plain = cost_of(view, reference, source[None], translation)[2:-2, 10:12, 1]
     assert adaptive.max() < 0.05
     assert plain.min() > 0.2
+
+
+def test_a_thing_that_is_too_wide_loses_its_rim_and_nothing_else() -> None:
+    true = np.full((40, 40), 0.2, np.float32)
+    true[10:30, 10:30] = 0.5
+    wide = true.copy()
+    wide[7:33, 7:33] = 0.5
+    found = trimmed(wide, lambda d: np.abs(d - true)[..., None])
+    assert (wide != true).sum() > 250
+    assert (found != true).sum() <= 4, "but for the corners"
+    np.testing.assert_array_equal(trimmed(true, lambda d: np.abs(d - true)[..., None]), true)
+    blank = trimmed(wide, lambda d: np.ones((40, 40, 5), np.float32))
+    np.testing.assert_array_equal(blank, wide)
 
 
 @settings(max_examples=50, deadline=None)

@@ -84,13 +84,22 @@ def test_only_what_others_agree_with_is_believed() -> None:
 
     still = np.eye(4)
     # Three frames from the same place: they agree on the right half, on the left each says something else.
-    others = [(still, raw(float(left))) for left in rng.uniform(0.8, 2.0, 3)]
-    found = confirm(raw(0.3), others, view, prior, nothing_moves, DepthSettings())
+    others = [(still, raw(float(left))) for left in rng.uniform(0.1, 0.2, 3)]
+    found = confirm(raw(0.5), others, view, prior, nothing_moves, DepthSettings())
     assert (found.belief[:, 42:] > 0.8).all()
     assert not found.belief[:, :38].any()
     assert not found.weight[:, :38].any()
+    # What others cannot see behind something nearer is not contradicted: it counts a little if it correlates well.
+    nearer = [(still, raw(float(left))) for left in rng.uniform(0.8, 2.0, 3)]
+    hidden, doubtful = (
+        confirm(raw(0.31, score), nearer, view, prior, nothing_moves, DepthSettings()) for score in (0.9, 0.6)
+    )
+    assert not hidden.belief[:, :38].any()
+    assert 0 < hidden.weight[:, :38].min() <= hidden.weight[:, :38].max() < 0.1
+    assert not doubtful.weight[:, :38].any()
     unsure = confirm(raw(0.3, score=0.1), others, view, prior, nothing_moves, DepthSettings())
     assert not unsure.belief.any()
-    alone = confirm(raw(0.3), [], view, prior, nothing_moves, DepthSettings())
+    alone = confirm(raw(0.9), [], view, prior, nothing_moves, DepthSettings())
     assert not alone.belief.any()
-    assert 0 < alone.weight.max() < 0.2
+    assert 0 < alone.weight[:, 40:].max() < 0.2
+    assert not alone.weight[:, :40].any(), "nearer than anything that is known"

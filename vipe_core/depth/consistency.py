@@ -97,10 +97,11 @@ def confirm(
     distinct = np.clip(raw.margin / _SURE_MARGIN, 0, 1)
     belief = np.where(believed, share * score * np.maximum(distinct, _LEAST_DISTINCT), 0).astype(np.float32)
     belief[belief < _MIN_BELIEF] = 0
-    # Nobody can be asked about an answer that is far too near, either: it counts for nothing without a margin, or
-    # outside of the range that is searched.
-    alone = (asked == 0) & ~moving & (value >= prior.low) & (value <= prior.high)
-    weight = np.where(alone, _LONE_BELIEF * score * distinct, belief) ** 2
+    # Nobody can be asked about what things hide from all others but those that agree. Nor about an answer that is far
+    # too near: it counts for nothing without a margin, or outside of the range that is searched.
+    alone = (asked == 0) | ((votes == asked - hidden) & (raw.score > _SURE_SCORE))
+    alone &= ~moving & (value >= prior.low) & (value <= prior.high)
+    weight = np.where(alone & (belief == 0), _LONE_BELIEF * score * distinct, belief) ** 2
     return Confirmed((value * (1 + ratios) / (1 + votes)).astype(np.float32), belief, weight.astype(np.float32), moving)
 
 

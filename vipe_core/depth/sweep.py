@@ -122,7 +122,7 @@ class PlaneSweep:
         coarse = np.maximum(coarse, np.float32(0.05 * prior.low))
         depth, _ = upsample(coarse, np.clip(1 - raw, 0, 1), gray, half, _UPSAMPLE_EDGE, _UPSAMPLE_SAME)
         step = cv2.resize(reach, (width, height), interpolation=cv2.INTER_LINEAR)
-        base = self._trimmed(
+        base = trimmed(
             1 / depth, lambda d: cost_of(self.fine, fine_gray, d, step, _TRIAL, images, settings.fine_radius)
         )
         offsets = np.linspace(-1, 1, settings.fine_planes, dtype=np.float32)
@@ -137,20 +137,26 @@ class PlaneSweep:
         score[cv2.resize(at_end, (width, height), interpolation=cv2.INTER_NEAREST) > 0] = 0
         return RawDepth(found, score, np.asarray(sure, np.float32), True)
 
-    def _trimmed(self, inverse_depth: Array, cost_at: Callable[[Array], Array]) -> NDArray[np.float32]:
-        """Things without the rim that the windows of the coarse sweep gave them: what lies beside them is tried there."""
-        side = 2 * _RIM_PX + 1
-        behind = cv2.erode(inverse_depth, np.ones((side, side), np.uint8))
-        rim = behind < (1 - _OTHER_SURFACE) * inverse_depth
-        if not rim.any():
-            return np.asarray(inverse_depth, np.float32)
-        here, there = (cost_at(d).min(axis=2) for d in (inverse_depth, np.where(rim, behind, inverse_depth)))
-        better = cv2.blur(np.where(rim, here - there, 0).astype(np.float32), (3, 3)) > _BETTER
-        return np.where(rim & better, behind, inverse_depth).astype(np.float32)
-
     def _aggregated(self, cost: Array, gray: Array) -> Array:
         s = self._settings
         return np.asarray(aggregate(cost, gray, s.smooth_small, s.smooth_large, s.smooth_edge))
+
+
+def trimmed(inverse_depth: Array, cost_at: Callable[[Array], Array]) -> NDArray[np.float32]:
+    """Things without the rim that the coarse windows gave them: what lies behind, beside them, is tried there.
+
+    Args:
+        inverse_depth: (h, w).
+        cost_at: Matching costs (h, w, D) of hypotheses around an inverse depth (h, w).
+    """
+    side = 2 * _RIM_PX + 1
+    behind = cv2.erode(inverse_depth, np.ones((side, side), np.uint8))
+    rim = behind < (1 - _OTHER_SURFACE) * inverse_depth
+    if not rim.any():
+        return np.asarray(inverse_depth, np.float32)
+    here, there = (cost_at(d).min(axis=2) for d in (inverse_depth, np.where(rim, behind, inverse_depth)))
+    better = cv2.blur(np.where(rim, here - there, 0).astype(np.float32), (3, 3)) > _BETTER
+    return np.where(rim & better, behind, inverse_depth).astype(np.float32)
 
 
 def hypotheses(low: float, high: float, count: int) -> NDArray[np.float32]:
