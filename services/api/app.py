@@ -92,8 +92,8 @@ _operations = APIRouter(tags=["operations"])
 
 
 @_operations.get("/healthz")
-def healthz() -> Status:
-    """The process answers."""
+async def healthz() -> Status:
+    """The process answers, also while every thread waits for the database."""
     return Status()
 
 

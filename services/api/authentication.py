@@ -10,6 +10,7 @@ import threading
 import time
 from collections import OrderedDict
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -64,7 +65,8 @@ class Authenticator:
         self._bootstrap = None if settings.api_key is None else self._digest(settings.api_key.get_secret_value())
         self.anonymous = Caller(DEFAULT_TENANT, None, ALL_SCOPES) if serves_anonymous(settings) else None
         self._lock = threading.Lock()
-        self._one_scrypt_at_a_time = threading.Lock()  # each takes 16 MiB and a core
+        # One hash at a time takes a core already; and each thread that hashes keeps 16 MiB, as malloc has it.
+        self._hasher = ThreadPoolExecutor(max_workers=1, thread_name_prefix="scrypt")
         self._verified: OrderedDict[bytes, _Verified] = OrderedDict()
 
     def remembered(self, key: str) -> Caller | None:
@@ -101,8 +103,7 @@ class Authenticator:
             known = self._verified.get(digest)
         right = known is not None and known.kept_hash == kept_hash
         if not right:
-            with self._one_scrypt_at_a_time:
-                right = matches(key, kept_hash)
+            right = self._hasher.submit(matches, key, kept_hash).result()
         if not right or not valid:
             with self._lock:
                 self._verified.pop(digest, None)
@@ -161,7 +162,7 @@ _bearer = HTTPBearer(
 )
 
 
-def authorised(
+async def authorised(
     request: Request,
     needed: SecurityScopes,
     _documented: Annotated[HTTPAuthorizationCredentials | None, Security(_bearer)],

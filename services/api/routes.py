@@ -1,4 +1,7 @@
-"""Jobs over HTTP. Handlers are synchronous: they run in the thread pool, never in the event loop."""
+"""Jobs over HTTP. Handlers are synchronous: they run in the thread pool, never in the event loop.
+
+What they depend on is asynchronous, as it waits for nothing: each would be a trip to the pool of its own.
+"""
 
 from __future__ import annotations
 
@@ -43,12 +46,12 @@ Limit = Annotated[int, Query(ge=1, le=1000, description="Most items on the page.
 PageToken = Annotated[str | None, Query(max_length=1024, description="`next_page_token` of the page before.")]
 
 
-def get_store(request: Request) -> Store:
+async def get_store(request: Request) -> Store:
     store: Store = request.app.state.store
     return store
 
 
-def require_json(content_type: Annotated[str, Header(include_in_schema=False)] = "") -> None:
+async def require_json(content_type: Annotated[str, Header(include_in_schema=False)] = "") -> None:
     media_type = content_type.partition(";")[0].strip().lower()
     if media_type != "application/json":
         raise UnsupportedMediaType(f"the body must be application/json, not {media_type or 'untyped'}")

@@ -6,6 +6,7 @@ import socket
 import ssl
 
 import uvicorn
+from anyio import to_thread
 from fastapi import FastAPI
 
 from services.api.authentication import serves_anonymous
@@ -15,6 +16,8 @@ from services.settings import Settings
 from services.store.base import Store
 
 _DRAIN_S = 10
+# What runs in them is short and mostly Python: more of them only take turns with the interpreter's lock.
+_THREADS = 16
 
 
 class ApiServer(uvicorn.Server):
@@ -30,6 +33,10 @@ class ApiServer(uvicorn.Server):
         host, port = self.servers[0].sockets[0].getsockname()[:2]
         scheme = "https" if self.config.is_ssl else "http"
         return f"{scheme}://[{host}]:{port}" if ":" in host else f"{scheme}://{host}:{port}"
+
+    async def startup(self, sockets: list[socket.socket] | None = None) -> None:
+        to_thread.current_default_thread_limiter().total_tokens = _THREADS
+        await super().startup(sockets)
 
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
         self._app.state.draining.set()

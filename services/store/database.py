@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import logging
+import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
@@ -91,6 +93,7 @@ class Database:
     def __init__(self, url: str) -> None:
         parsed = make_url(url)
         self.dialect = parsed.get_backend_name()
+        self._writer = threading.Lock()
         if self.dialect == "sqlite":
             if not parsed.database or parsed.database == ":memory:":
                 raise ValueError("the store needs a file: use sqlite:////absolute/path/vipe.db")
@@ -131,11 +134,27 @@ class Database:
         self.engine.dispose()
 
     def _write_once(self, work: Callable[[Tx], _T]) -> _T:
-        with self.engine.connect().execution_options(**{_WRITE: True}) as conn, conn.begin():
+        with self._turn(), self.engine.connect().execution_options(**{_WRITE: True}) as conn, conn.begin():
             tx = Tx(conn, self._now(conn))
             result = work(tx)
             tx.flush_events()
             return result
+
+    @contextmanager
+    def _turn(self) -> Iterator[None]:
+        """SQLite lets one transaction write; who waits for it sleeps and looks again, and some never get their turn.
+
+        Threads of this process therefore queue here, and only processes meet in the file.
+        """
+        if self.dialect != "sqlite":
+            yield
+            return
+        if not self._writer.acquire(timeout=_SQLITE_PATIENCE_MS / 1e3):
+            raise StoreUnavailable("the database does not answer (others have been writing for too long); try again")
+        try:
+            yield
+        finally:
+            self._writer.release()
 
     def _now(self, conn: Connection) -> datetime:
         if self.dialect == "sqlite":
