@@ -68,6 +68,9 @@ class Settings(BaseSettings):
     rate_limit_burst: int = Field(default=500, ge=1)
     """Requests that one key may send at once."""
 
+    max_wrong_keys: int = Field(default=20, ge=1)
+    """Wrong keys that one address may send at once; after that one every two seconds."""
+
     max_streams_per_key: int = Field(default=100, ge=1)
     """Event streams that one key, or one address where no key is needed, may have open."""
 

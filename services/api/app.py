@@ -73,6 +73,7 @@ def create_app(
         trail=app.state.trail,
         rate_per_s=settings.rate_limit_per_s,
         burst=settings.rate_limit_burst,
+        max_wrong_keys=settings.max_wrong_keys,
     )
     app.add_middleware(OwnOrigins, allowed=settings.cors_origins)
     if settings.cors_origins:

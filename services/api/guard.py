@@ -21,8 +21,7 @@ from services.domain.errors import ServiceError
 
 _READING = frozenset({"GET", "HEAD", "OPTIONS"})
 _ALWAYS_ANSWERED = "/healthz"
-# Wrong keys from one address: so many at once, then one every two seconds. Each may cost a scrypt.
-_WRONG_KEYS_BURST, _WRONG_KEYS_PER_S = 20, 0.5
+_WRONG_KEYS_PER_S = 0.5
 
 
 class Guard:
@@ -34,6 +33,7 @@ class Guard:
         trail: Takes what happened.
         rate_per_s: Requests of one key, or of one address where no key is needed.
         burst: How many of them at once.
+        max_wrong_keys: How many wrong keys of one address at once; then one every two seconds. Each may cost a scrypt.
     """
 
     def __init__(
@@ -44,12 +44,13 @@ class Guard:
         trail: AuditTrail,
         rate_per_s: float,
         burst: int,
+        max_wrong_keys: int,
     ) -> None:
         self._app = app
         self._authenticator = authenticator
         self._trail = trail
         self._requests = TokenBuckets(rate_per_s, burst)
-        self._wrong_keys = TokenBuckets(_WRONG_KEYS_PER_S, _WRONG_KEYS_BURST)
+        self._wrong_keys = TokenBuckets(_WRONG_KEYS_PER_S, max_wrong_keys)
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] != "http" or scope["path"] == _ALWAYS_ANSWERED:
@@ -58,11 +59,7 @@ class Guard:
         address = address_of(scope)
         try:
             caller = await self._caller(scope, address) if _needs_caller(scope["path"]) else None
-            name = (caller.key_id if caller is not None else None) or address
-            wait_s = self._requests.wait_s(name)
-            if wait_s > 0:
-                raise RateLimited("too many requests", retry_after_s=wait_s)
-            self._requests.take(name)
+            self._count((caller.key_id if caller is not None else None) or address)
         except ServiceError as error:
             await problems.of(scope, error)(scope, receive, send)
             return
@@ -74,27 +71,36 @@ class Guard:
 
     async def _caller(self, scope: Scope, address: str) -> Caller:
         kind, _, key = Headers(scope=scope).get("authorization", "").partition(" ")
-        key = key.strip()
-        if not kind:
-            if self._authenticator.anonymous is not None:
-                return self._authenticator.anonymous
-            key = ""
-        elif kind.lower() == "bearer" and (caller := self._authenticator.remembered(key)) is not None:
-            return caller
-        if not self._authenticator.seen(key) and (wait_s := self._wrong_keys.wait_s(address)) > 0:
-            raise RateLimited("too many wrong keys came from this address", retry_after_s=wait_s)
+        if not kind and self._authenticator.anonymous is not None:
+            return self._authenticator.anonymous
+        key = key.strip() if kind.lower() == "bearer" else ""
+        if key:
+            caller = self._authenticator.remembered(key)
+            if caller is not None:
+                return caller
+            if not self._authenticator.seen(key) and (wait_s := self._wrong_keys.wait_s(address)) > 0:
+                raise RateLimited("too many wrong keys came from this address", retry_after_s=wait_s)
+        else:
+            self._count(address)
         try:
-            if kind.lower() != "bearer" or not key:
+            if not key:
                 raise Unauthorized("send an API key as `Authorization: Bearer <key>`")
             return await run_sync(self._authenticator.verify, key)
         except Unauthorized as error:
-            self._wrong_keys.take(address)
+            if key:
+                self._wrong_keys.take(address)
             tenant, key_id = (error.tenant, error.key_id) if isinstance(error, RefusedKey) else (None, None)
             entry = AuditEntry(
                 tenant, key_id, address, _request_id(scope), "authenticate", _object(scope), error.status, error.code
             )
             await run_sync(self._trail.refused, entry)
             raise
+
+    def _count(self, name: str) -> None:
+        wait_s = self._requests.wait_s(name)
+        if wait_s > 0:
+            raise RateLimited("too many requests", retry_after_s=wait_s)
+        self._requests.take(name)
 
     async def _audited(self, caller: Caller, address: str, scope: Scope, receive: Receive, send: Send) -> None:
         recorded = False

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
+import re
 from http import HTTPStatus
 from typing import Any, ClassVar
 
@@ -131,6 +132,15 @@ def responses(*statuses: int) -> dict[int | str, dict[str, Any]]:
     }
 
 
+def _methods(document: dict[str, Any], path: str) -> str:
+    """What a path can be asked for; the framework names the methods of the first route that has it only."""
+    found = set()
+    for template, operations in document["paths"].items():
+        if re.fullmatch(re.sub(r"\\{\w+\\}", "[^/]+", re.escape(template)), path):
+            found |= {method.upper() for method in operations}
+    return ", ".join(sorted(found))
+
+
 def install(app: FastAPI) -> None:
     """Handle the service's errors, invalid requests, and what the framework raises by itself."""
 
@@ -158,5 +168,7 @@ def install(app: FastAPI) -> None:
             404: f"there is nothing at {request.url.path}",
             405: f"{request.method} is not allowed at {request.url.path}",
         }.get(error.status_code, str(error.detail))
-        headers = None if error.headers is None else dict(error.headers)
+        headers = dict(error.headers or {})
+        if error.status_code == 405 and (methods := _methods(request.app.openapi(), request.url.path)):
+            headers["Allow"] = methods
         return response(request.scope, error.status_code, code, detail, headers=headers)
