@@ -20,7 +20,9 @@ def _default_data_dir() -> Path:
 class Settings(BaseSettings):
     """Defaults run everything on one machine: SQLite, a private Ray, the API on loopback."""
 
-    model_config = SettingsConfigDict(env_prefix="VIPE_", extra="forbid", frozen=True, use_attribute_docstrings=True)
+    model_config = SettingsConfigDict(
+        env_prefix="VIPE_", extra="forbid", frozen=True, use_attribute_docstrings=True, hide_input_in_errors=True
+    )
 
     data_dir: Path = Field(default_factory=_default_data_dir)
     """Where the embedded database and the scratch folder live. On a local disk."""

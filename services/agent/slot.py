@@ -37,6 +37,7 @@ from services.agent.scratch import ShardScratch, sweep
 from services.agent.traffic import TrafficRecorder
 from services.domain.errors import InputUnavailable, ObjectMissing, ServiceError, StorageError
 from services.domain.models import VideoRef, VideoResult
+from services.domain.redaction import redact
 from services.domain.states import VideoStatus
 from services.inputs.fetching import Fetched, fetched
 from services.inputs.rules import InputRules
@@ -221,7 +222,9 @@ def _rss_bytes() -> int:
 
 def failed_row(video: VideoRef, attempt: int, code: str, message: str) -> VideoResult:
     """The index row of a video that has no artifacts."""
-    return VideoResult(video.key, video.uri, VideoStatus.FAILED, attempt, error_code=code, error_message=message)
+    return VideoResult(
+        video.key, video.uri, VideoStatus.FAILED, attempt, error_code=code, error_message=redact(message)
+    )
 
 
 def _one_line(error: BaseException, path: Path, video: VideoRef) -> str:

@@ -18,6 +18,7 @@ from services.api.limits import TokenBuckets, address_of
 from services.api.problems import RateLimited, Unauthorized
 from services.domain.access import AuditEntry, Caller
 from services.domain.errors import ServiceError
+from services.domain.redaction import redact
 
 _READING = frozenset({"GET", "HEAD", "OPTIONS"})
 _ALWAYS_ANSWERED = "/healthz"
@@ -143,6 +144,6 @@ def _request_id(scope: Scope) -> str:
 
 
 def _object(scope: Scope) -> str:
-    """The path, as a database can hold it."""
-    path = str(scope["path"])[:512].replace("\x00", "\ufffd")
+    """The path, as a database can and may hold it."""
+    path = redact(str(scope["path"]))[:512].replace("\x00", "\ufffd")
     return path.encode("utf-8", "replace").decode()

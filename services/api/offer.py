@@ -7,6 +7,7 @@ from functools import cache
 from typing import Literal, get_args
 
 from services.domain.errors import AddressRefused
+from services.domain.redaction import redact
 from services.network.addresses import NetworkPolicy
 
 # What the engine writes for every video.
@@ -72,6 +73,8 @@ def address(value: str) -> str:
             NetworkPolicy(("*:*",)).endpoint(value)
         except AddressRefused as error:
             raise ValueError(str(error)) from error
+        if redact(value) != value:
+            raise ValueError("an address must not hold credentials: it is kept in the database and in the output")
         segments = []
     elif value.startswith("/") and not value.startswith("//"):
         segments = [s for s in value.split("/") if s]

@@ -16,6 +16,7 @@ from starlette.exceptions import HTTPException
 from starlette.types import Scope
 
 from services.domain.errors import ServiceError
+from services.domain.redaction import redact
 
 MEDIA_TYPE = "application/problem+json"
 _MAX_FIELD_ERRORS = 50
@@ -104,8 +105,8 @@ def response(
         type=f"urn:vipe:problem:{code}",
         title=code.replace("_", " ").capitalize(),
         status=status,
-        detail=detail,
-        instance=scope["path"],
+        detail=redact(detail),
+        instance=redact(scope["path"]),
         code=code,
         request_id=scope.get("state", {}).get("request_id", ""),
         errors=errors or [],
@@ -153,7 +154,7 @@ def install(app: FastAPI) -> None:
     @app.exception_handler(RequestValidationError)
     def on_invalid_request(request: Request, error: RequestValidationError) -> JSONResponse:
         found = [
-            FieldError(field=".".join(str(part) for part in e["loc"]), message=str(e["msg"]))
+            FieldError(field=".".join(str(part) for part in e["loc"]), message=redact(str(e["msg"])))
             for e in error.errors()[:_MAX_FIELD_ERRORS]
         ]
         if any(e["type"] == "json_invalid" for e in error.errors()):

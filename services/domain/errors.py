@@ -8,6 +8,8 @@ from __future__ import annotations
 
 from typing import ClassVar
 
+from services.domain.redaction import redact
+
 
 class ServiceError(Exception):
     """Base of every error that the service raises on purpose. The message is shown to the caller."""
@@ -175,4 +177,4 @@ class IntegrityError(ServiceError):
 def code_and_message(error: Exception) -> tuple[str, str]:
     """What a failed job says: a code and one line."""
     code = error.code if isinstance(error, ServiceError) else "internal_error"
-    return code, next(iter(str(error).splitlines()), type(error).__name__)
+    return code, redact(next(iter(str(error).splitlines()), type(error).__name__))

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import json
 import logging
-import re
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -16,41 +15,13 @@ from contextvars import ContextVar
 from datetime import UTC, datetime
 from typing import Literal, TextIO
 
+from services.domain.redaction import redact
+
 LogFormat = Literal["json", "text"]
 
 _context: ContextVar[tuple[tuple[str, str], ...]] = ContextVar("vipe_log_context", default=())
 
-_SECRETS = (
-    # user:password@ in an address
-    (re.compile(r"(?P<keep>[a-z][a-z0-9+.-]*://[^\s/:@]+:)[^\s/@]+(?=@)", re.IGNORECASE), r"\g<keep>***"),
-    # name=value, name: value, "name": "value"
-    (
-        re.compile(
-            r"(?P<keep>(?:password|passwd|secret|secret_access_key|token|api[_-]?key|x-amz-signature"
-            r"|x-amz-credential|x-amz-security-token)[\"']?\s*[=:]\s*[\"']?)[^\s\"'&,;]+",
-            re.IGNORECASE,
-        ),
-        r"\g<keep>***",
-    ),
-    (
-        re.compile(r"(?P<keep>authorization[\"']?\s*[=:]\s*[\"']?(?:bearer\s+|basic\s+)?)[^\s\"',;]+", re.IGNORECASE),
-        r"\g<keep>***",
-    ),
-    (re.compile(r"(?P<keep>bearer\s+)[a-z0-9._~+/=-]{8,}", re.IGNORECASE), r"\g<keep>***"),
-    # our own keys, of which the id may be told
-    (re.compile(r"(?P<keep>vipe_[a-z2-7]{12}_)[a-z2-7]+"), r"\g<keep>***"),
-    # access key ids
-    (re.compile(r"\b(?:AKIA|ASIA)[A-Z0-9]{16}\b"), "***"),
-)
-
 _STANDARD = frozenset(vars(logging.makeLogRecord({}))) | {"message", "asctime", "taskName", "color_message"}
-
-
-def redact(text: str) -> str:
-    """The text without passwords, tokens, signatures and access keys."""
-    for pattern, replacement in _SECRETS:
-        text = pattern.sub(replacement, text)
-    return text
 
 
 @contextmanager

@@ -24,6 +24,7 @@ from services.domain.models import (
     Shard,
     ShardPlan,
 )
+from services.domain.redaction import redact
 from services.domain.states import JobState, VideoStatus
 from services.store import audit, commits, idempotency, jobs, keys, leases, migrations, planning, reading
 from services.store.base import Deferral, VideoRow
@@ -111,7 +112,7 @@ class SqlStore:
         return self._db.write(lambda tx: planning.finish(tx, job_id, fence))
 
     def fail_job(self, job_id: str, code: str, message: str, *, planning_fence: int | None = None) -> None:
-        self._db.write(lambda tx: jobs.fail_job(tx, job_id, code, message, planning_fence))
+        self._db.write(lambda tx: jobs.fail_job(tx, job_id, code, redact(message), planning_fence))
 
     def defer_job(self, job_id: str, *, base_s: float, max_s: float, planning_fence: int | None = None) -> Deferral:
         return self._db.write(lambda tx: jobs.defer_job(tx, job_id, base_s, max_s, planning_fence))

@@ -7,6 +7,7 @@ import sys
 import threading
 
 from services.api import create_app, create_server
+from services.observability.logging import configure_logging
 from services.settings import Settings
 from services.store.sql import SqlStore
 
@@ -15,6 +16,7 @@ def main() -> None:
     os.environ["VIPE_PORT"] = "0"
     os.environ.update({f"VIPE_{name.upper()}": value for name, value in (arg.split("=", 1) for arg in sys.argv[2:])})
     settings = Settings(database_url=sys.argv[1])
+    configure_logging(settings.log_level, settings.log_format)
     store = SqlStore(settings.database_url)
     server = create_server(create_app(store, settings), settings)
 

@@ -9,6 +9,7 @@ import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import IO
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -21,10 +22,11 @@ class Service:
 
 
 @contextlib.contextmanager
-def running(database_url: str, *settings: str) -> Iterator[Service]:
+def running(database_url: str, *settings: str, stderr: IO[str] | None = None) -> Iterator[Service]:
     process = subprocess.Popen(
         [sys.executable, str(Path(__file__).with_name("api_process.py")), database_url, *settings],
         stdout=subprocess.PIPE,
+        stderr=stderr,
         text=True,
         cwd=ROOT,
         env={**os.environ, "PYTHONPATH": str(ROOT)},
