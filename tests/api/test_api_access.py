@@ -245,7 +245,7 @@ class TestAudit:
         with running(f"sqlite:///{tmp_path}/store.db", f"api_key={BOOTSTRAP}") as service:
             store = SqlStore(service.database_url)
             claimed, right = store.create_key("x", tenant="a")
-            with httpx.Client(base_url=service.url) as http:
+            with httpx.Client(base_url=service.url, timeout=60) as http:
                 wrong = [f"vipe_{claimed.id}_" + "a" * 52, *(f"guess-{i}" for i in range(200))]
                 answers = [http.get("/v1/jobs", headers={"Authorization": f"Bearer {key}"}) for key in wrong]
                 codes = [answer.status_code for answer in answers]
@@ -268,12 +268,14 @@ class TestAudit:
 
 class TestLimits:
     def test_too_many_requests(self, tmp_path: Path) -> None:
-        limits = ("rate_limit_per_s=0.5", "rate_limit_burst=5", "allow_anonymous=false", f"api_key={BOOTSTRAP}")
+        limits = ("rate_limit_per_s=0.1", "rate_limit_burst=5", "allow_anonymous=false", f"api_key={BOOTSTRAP}")
         with running(f"sqlite:///{tmp_path}/store.db", *limits) as service:
             store = SqlStore(service.database_url)
             _, other = store.create_key("x")
             store.close()
-            with httpx.Client(base_url=service.url, headers={"Authorization": f"Bearer {BOOTSTRAP}"}) as http:
+            with httpx.Client(
+                base_url=service.url, timeout=60, headers={"Authorization": f"Bearer {BOOTSTRAP}"}
+            ) as http:
                 answers = [http.get("/v1/jobs") for _ in range(8)]
                 assert [a.status_code for a in answers[:5]] == [200] * 5
                 problem = assert_problem(answers[-1], 429, "rate_limited")
@@ -322,7 +324,7 @@ class TestLimits:
                 with socket.create_connection((host, int(port)), timeout=60) as slow:
                     slow.sendall(begun)
                     assert slow.recv(1000) == b"", "closed"
-            with httpx.Client(base_url=service.url) as kept, kept.stream("GET", "/healthz") as first:
+            with httpx.Client(base_url=service.url, timeout=60) as kept, kept.stream("GET", "/healthz") as first:
                 connection = first.extensions["network_stream"]
                 first.read()
                 for _ in range(3):
@@ -356,7 +358,7 @@ class TestBrowsers:
         allowed = 'cors_origins=["https://viewer.example"]'
         with (
             running(f"sqlite:///{tmp_path}/store.db", allowed, f"api_key={BOOTSTRAP}") as service,
-            httpx.Client(base_url=service.url) as http,
+            httpx.Client(base_url=service.url, timeout=60) as http,
         ):
             ask = {
                 "Access-Control-Request-Method": "POST",
@@ -375,7 +377,7 @@ class TestBrowsers:
         allowed = 'allowed_hosts=["vipe.example", "*.cluster.local"]'
         with (
             running(f"sqlite:///{tmp_path}/store.db", allowed, f"api_key={BOOTSTRAP}") as service,
-            httpx.Client(base_url=service.url, headers={"Authorization": f"Bearer {BOOTSTRAP}"}) as http,
+            httpx.Client(base_url=service.url, timeout=60, headers={"Authorization": f"Bearer {BOOTSTRAP}"}) as http,
         ):
             for host in ("vipe.example", "VIPE.example:443", "api.cluster.local"):
                 assert http.get("/v1/jobs", headers={"Host": host}).status_code == 200

@@ -13,7 +13,7 @@ def test_outputs_outside_of_the_roots_are_refused_at_once(tmp_path: Path) -> Non
     allowed = tmp_path / "allowed"
     with (
         running(f"sqlite:///{tmp_path}/store.db", f'output_roots=["{allowed}"]') as service,
-        httpx.Client(base_url=service.url) as http,
+        httpx.Client(base_url=service.url, timeout=60) as http,
     ):
         for output in (str(tmp_path / "elsewhere"), str(tmp_path / "allowed-not")):
             problem = assert_problem(

@@ -35,7 +35,7 @@ def test_nothing_secret_is_written_down(tmp_path: Path, log_format: str) -> None
         with running(f"sqlite:///{database}", *settings, stderr=log) as service:
             for bearer in (BOOTSTRAP, key, wrong, "guess-hunter2"):
                 headers = {"Authorization": f"Bearer {bearer}"}
-                with httpx.Client(base_url=service.url, headers=headers) as http:
+                with httpx.Client(base_url=service.url, headers=headers, timeout=60) as http:
                     answers += [
                         http.get("/v1/jobs"),
                         http.get(f"/v1/jobs?api_key={key}&page_token=page-hunter2"),
