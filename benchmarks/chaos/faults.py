@@ -129,7 +129,7 @@ class Injector:
 
     def _strike(self, fault: Injected, number: int, find: Callable[[], Process | None]) -> None:
         """Hit a process while it works on a video that nothing has happened to, so that it is not blamed twice."""
-        deadline = time.monotonic() + 25
+        deadline = time.monotonic() + 90
         while time.monotonic() < deadline:
             video = running_video(self.world, fault.agent)
             process = find()

@@ -50,9 +50,10 @@ def account_for_lost_work(work: list[dict[str, Any]], faults: list[Injected]) ->
             fault = max(candidates, key=lambda f: f.at, default=None)
             seconds = until - begin
         else:
-            near = [f for f in happened if f.agent == attempt["agent"] and -2.0 <= f.at - begin <= 60.0]
+            of_agent = [f for f in happened if f.agent == attempt["agent"] and f.kind.working == "agent"]
+            near = [f for f in of_agent if begin - 1.0 <= (f.noticed or f.at) and f.at <= begin + 60.0]
             fault = next((f for f in near if f.video == attempt["video"]), None) or min(
-                near, key=lambda f: f.at - begin, default=None
+                near, key=lambda f: abs(f.at - begin), default=None
             )
             seconds = max(0.0, (fault.noticed or fault.at) - begin) if fault else 0.0
         if fault is not None:
@@ -91,7 +92,7 @@ def judge(store: SqlStore, job_id: str, faults: list[Injected], verified: tuple[
         elif name == "cut":
             right = row.status is VideoStatus.FAILED and code_found == "media_corrupt"
         elif name in guilty:
-            right = row.status is VideoStatus.FAILED and code_found == "engine_error"
+            right = row.status is VideoStatus.FAILED and code_found == "engine_failed"
         else:
             right = row.status is VideoStatus.SUCCEEDED
         if not right:

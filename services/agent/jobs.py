@@ -14,7 +14,7 @@ from services.domain.models import Job
 from services.domain.states import JobState
 from services.observability.logging import context
 from services.observability.metrics import Metrics
-from services.planner import plan_next
+from services.planner import plan_next, write_plan
 from services.store.base import Store
 
 logger = logging.getLogger(__name__)
@@ -106,8 +106,10 @@ class JobKeeper:
 
             scratch = self._config.scratch_dir / "finalise"
             scratch.mkdir(parents=True, exist_ok=True)
+            output = self._committer.output(job.spec.output)
+            write_plan(output, self._store, job)  # A retry has added to it since it was planned.
             finalise(
-                self._committer.output(job.spec.output),
+                output,
                 job.id,
                 job.spec,
                 num_shards=job.progress.shards_total,

@@ -5,9 +5,11 @@
               | over its wall budget: kill, restart, try the video once more at the end, then `video_timeout`
               | storage down: back off, then give the lease back
 
-Two coordinated caps keep one bad part from taking the rest with it. A video that kills the worker is tried last and is
-quarantined after `max_worker_deaths`; a slot on which distinct videos die in a row is itself the suspect and is fenced
-before it can quarantine the innocent.
+Coordinated caps keep one bad part from taking the rest with it. A video that kills the worker is tried last and is
+quarantined after `max_worker_deaths`, or after fewer in different places. A slot on which distinct videos die in a row
+is itself the suspect and is fenced before it can quarantine the innocent. Where a slot has seen nothing but the deaths
+of one video, it cannot tell which of the two is bad: before its last try the shard is given back, so that another slot
+may say.
 """
 
 from __future__ import annotations
@@ -369,8 +371,11 @@ class Supervisor:
         logger.error(
             "the worker died (%d of %d): %s", len(deaths[video.key]), self._config.max_worker_deaths, died.detail
         )
-        if first:  # A video that is known to kill says nothing new about the slot.
+        again = video.key in self._suspicious
+        if first or self._suspicious:  # A known killer alone says nothing new about the slot.
             self._suspect(video.key)
+        if again and len(deaths[video.key]) == self._config.max_worker_deaths - 1:
+            raise self._given_back(live, Failed(WORKER_DIED, f"{video.uri}: another slot is asked", True, "shard"))
 
     def _blame(self, lease: Lease, video: VideoRef, death: Death, before: tuple[Death, ...]) -> tuple[Death, ...]:
         """Count the death where it survives this process; if the store does not answer, at least here."""
@@ -403,13 +408,16 @@ class Supervisor:
         return False
 
     def _suspect(self, key: str) -> None:
-        if key not in self._suspicious:
-            self._suspicious.append(key)
-        if len(self._suspicious) >= self._config.max_slot_deaths:
+        self._suspicious.append(key)
+        distinct = set(self._suspicious)
+        if len(self._suspicious) >= self._config.max_slot_deaths and len(distinct) >= min(
+            2, self._config.max_slot_deaths
+        ):
             logger.error(
-                "this slot is fenced: the worker died on %d distinct videos in a row (%s)",
+                "this slot is fenced: the worker died %d times in a row, on %d distinct videos (%s)",
                 len(self._suspicious),
-                ", ".join(self._suspicious),
+                len(distinct),
+                ", ".join(sorted(distinct)),
             )
             raise _Ended(ShardOutcome("given_back", "slot_fenced", "the worker keeps dying", fenced=True))
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from services.commit.gc import GcReport, collect_garbage
 from services.commit.layout import ATTRIBUTES, attributes_of, commit_key, payload_key
+from services.commit.plan import PlanHead, publish_plan, read_plan
 from services.commit.protocol import (
     CommitOutcome,
     PreparedPayload,
@@ -12,12 +13,13 @@ from services.commit.protocol import (
     write_decided,
     write_record,
 )
-from services.commit.reconcile import committed_record, committed_records
+from services.commit.reconcile import committed_record, committed_records, stored_records
 
 __all__ = [
     "ATTRIBUTES",
     "CommitOutcome",
     "GcReport",
+    "PlanHead",
     "PreparedPayload",
     "attributes_of",
     "collect_garbage",
@@ -26,6 +28,9 @@ __all__ = [
     "committed_records",
     "payload_key",
     "prepare_payload",
+    "publish_plan",
+    "read_plan",
+    "stored_records",
     "tar_names",
     "write_decided",
     "write_record",

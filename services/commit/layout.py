@@ -3,6 +3,8 @@
 payload/<prefix>-<8 hex>/{pose,intrinsics,depth,rgb,mask,confidence}.tar   what NVIDIA published its data sets in
 _commits/<job id>/<shard id>.json                               the create-once records; readers trust nothing else
 _claims/<prefix>-<8 hex>.json                                   who took a tar name
+_plan/<number>.json                                             which shards there must be, see `services.commit.plan`
+_job.json                                                       whose output it is
 meta.parquet, failures.parquet, dataset.json, README.md         written once every shard has its record
 """
 
@@ -17,7 +19,8 @@ from services.domain.errors import IntegrityError
 from services.domain.models import Attribute
 
 ATTRIBUTES: tuple[Attribute, ...] = get_args(Attribute)
-FOLDERS = ("payload/", "_commits/", "_claims/")
+FOLDERS = ("payload/", "_commits/", "_claims/", "_plan/")
+JOB_KEY = "_job.json"
 REQUIRED: tuple[Attribute, ...] = ("pose", "intrinsics")
 
 

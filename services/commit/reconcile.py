@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Iterator
 
 from services.commit.layout import commit_key, commit_prefix
@@ -17,11 +18,17 @@ def committed_records(store: ObjectStore, job_id: str) -> Iterator[CommitRecord]
     Raises:
         IntegrityError: A record is damaged or does not belong under its name.
     """
+    return (record for record, _ in stored_records(store, job_id))
+
+
+def stored_records(store: ObjectStore, job_id: str) -> Iterator[tuple[CommitRecord, str]]:
+    """`committed_records`, each with the sha256 of its bytes."""
     for info in store.list(commit_prefix(job_id)):
-        record = read_record(store.get_bytes(info.key), f"{store.uri}/{info.key}")
+        data = store.get_bytes(info.key)
+        record = read_record(data, f"{store.uri}/{info.key}")
         if commit_key(record.job_id, record.shard_id) != info.key or record.job_id != job_id:
             raise IntegrityError(f"{store.uri}/{info.key} is the record of shard {record.shard_id}, not of its name")
-        yield record
+        yield record, hashlib.sha256(data).hexdigest()
 
 
 def committed_record(store: ObjectStore, job_id: str, shard_id: str) -> CommitRecord | None:

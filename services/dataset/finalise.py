@@ -17,7 +17,8 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from services.commit.reconcile import committed_records
+from services.commit.plan import read_plan
+from services.commit.reconcile import stored_records
 from services.dataset.card import dataset_card
 from services.dataset.schema import (
     CARD_KEY,
@@ -103,6 +104,11 @@ class Completeness:
             else:
                 raise IntegrityError(f"video {video.key} of shard {record.shard_id} has no outcome")
 
+    @property
+    def ordinals(self) -> frozenset[int]:
+        """Numbers of the shards that have a record."""
+        return frozenset(self._ordinals)
+
     def close(self, num_shards: int | None, num_videos: int | None) -> Totals:
         """The totals, if they are what was planned; raises IntegrityError if not."""
         totals = self.totals
@@ -135,6 +141,7 @@ def finalise(
             Nothing was written.
         StorageError: The store refused.
     """
+    records = hashlib.sha256()
     with tempfile.TemporaryDirectory(dir=scratch, prefix="finalise-") as name:
         folder = Path(name)
         completeness = Completeness.of(store)
@@ -143,14 +150,15 @@ def finalise(
             _RowWriter(folder / FAILURES_KEY, FAILURES_SCHEMA) as failures,
             (folder / "shards").open("w", encoding="utf-8") as shards,
         ):
-            for record in committed_records(store, job_id):
+            for record, digest in stored_records(store, job_id):
+                records.update(digest.encode())
                 completeness.add(record)
                 for video in record.videos:
                     if video.status is VideoStatus.SUCCEEDED:
                         meta.write(meta_row(record, video))
                     else:
                         failures.write(failure_row(record, video))
-                shards.write(("" if completeness.totals.shards == 1 else ",\n") + json.dumps(_shard(record)))
+                shards.write(("" if completeness.totals.shards == 1 else ",\n") + json.dumps(_shard(record, digest)))
         totals = completeness.close(num_shards, num_videos)
         description = {
             "schema_version": SCHEMA_VERSION,
@@ -158,6 +166,8 @@ def finalise(
             "config_hash": spec.config_hash,
             "spec": public_spec(spec),
             "totals": asdict(totals),
+            "records_sha256": records.hexdigest(),
+            "plan": read_plan(store, job_id, lambda shard: None).to_json(),
         }
         _write_dataset_json(folder / DATASET_KEY, description, folder / "shards")
         (folder / CARD_KEY).write_text(dataset_card(job_id, spec, asdict(totals)), encoding="utf-8")
@@ -192,7 +202,7 @@ class _RowWriter:
             self._rows.clear()
 
 
-def _shard(record: CommitRecord) -> dict[str, Any]:
+def _shard(record: CommitRecord, digest: str) -> dict[str, Any]:
     return {
         "shard_id": record.shard_id,
         "ordinal": record.ordinal,
@@ -200,6 +210,7 @@ def _shard(record: CommitRecord) -> dict[str, Any]:
         "videos": len(record.videos),
         "frames": record.frames,
         "plan_hash": record.plan_hash,
+        "record_sha256": digest,
         "objects": [
             {"key": o.key, "attribute": o.attribute, "size_bytes": o.size_bytes, "sha256": o.sha256}
             for o in record.objects

@@ -98,6 +98,34 @@ class ShardPlan:
         return hashlib.sha256(json.dumps([self.ordinal, members]).encode()).hexdigest()
 
 
+@dataclass(frozen=True, slots=True)
+class PlannedShard:
+    """What a job's plan says about a shard.
+
+    Attributes:
+        videos: Their keys, in the order of the plan.
+    """
+
+    ordinal: int
+    plan_hash: str
+    videos: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class ShardDigest:
+    """What the database knows about a shard's record.
+
+    Attributes:
+        record_sha256: Of its bytes; None before it is committed, or where an earlier release committed it.
+    """
+
+    id: str
+    ordinal: int
+    state: ShardState
+    plan_hash: str
+    record_sha256: str | None
+
+
 def shard_id(job_id: str, ordinal: int) -> str:
     return f"{job_id}-{ordinal:06d}"
 

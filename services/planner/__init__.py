@@ -2,6 +2,6 @@
 
 from __future__ import annotations
 
-from services.planner.planning import Turn, plan, plan_next
+from services.planner.planning import CLAIM_KEY, Turn, plan, plan_next, write_plan
 
-__all__ = ["Turn", "plan", "plan_next"]
+__all__ = ["CLAIM_KEY", "Turn", "plan", "plan_next", "write_plan"]

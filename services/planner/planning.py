@@ -25,7 +25,7 @@ from services.domain.errors import (
     StoreUnavailable,
     code_and_message,
 )
-from services.domain.models import Job, ShardPlan
+from services.domain.models import Job, PlannedShard, ShardPlan
 from services.inputs.rules import InputRules, check_bucket
 from services.planner.listing import Found, expand
 from services.planner.packing import SeenVideos, new_videos, pack
@@ -34,7 +34,7 @@ from services.storage.open import open_store, supports_create_once
 from services.storage.roots import lies_within
 from services.store.base import Store, VideoRow
 
-CLAIM_KEY = "_job.json"
+CLAIM_KEY = "_job.json"  # as in `services.commit.layout`, behind whose package heavy libraries stand
 
 _log = logging.getLogger(__name__)
 _BATCH_SHARDS = 64
@@ -168,14 +168,44 @@ def plan(
             max_input_bytes=job.spec.shard_max_input_bytes,
             first_ordinal=job.progress.shards_total,
         )
+        output = open_store(job.spec.output, endpoint_url=s3_endpoint_url)
         for number, batch in enumerate(_batches(shards)):
             # Not before the first shard: a job whose inputs are wrong leaves no trace in its output.
-            output = open_store(job.spec.output, endpoint_url=s3_endpoint_url)
             if number == 0 and not _take_output(turn, output):
                 return
             if not turn.add(batch):
                 return
+        write_plan(output, turn.store, job, keep=turn.keep)
         turn.finish()
+
+
+def write_plan(
+    output: ObjectStore,
+    store: Store,
+    job: Job,
+    *,
+    keep: Callable[[Iterable[PlannedShard]], Iterable[PlannedShard]] = iter,
+) -> None:
+    """Let the output say which shards there must be; adds what it does not say yet.
+
+    Args:
+        keep: Passes the shards through, and may do something on the way.
+
+    Raises:
+        IntegrityError: The output has a plan that is damaged or another one.
+        StorageError: Storage does not answer.
+    """
+    from services.commit.plan import publish_plan  # Heavy packages stand behind its package.
+
+    def shards_from(ordinal: int) -> Iterator[PlannedShard]:
+        while page := store.planned_shards(job.id, first_ordinal=ordinal, limit=_PAGE):
+            yield from keep(page)
+            ordinal = page[-1].ordinal + 1
+
+    total = store.get_job(job.id).progress.shards_total
+    if total:
+        create_once = store.commit_point(job.id) is not False
+        publish_plan(output, job.id, job.spec.config_hash, shards_from, total, create_once=create_once)
 
 
 def check_output_place(output: str, roots: Sequence[Path], buckets: tuple[str, ...] = ()) -> None:

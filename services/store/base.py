@@ -22,8 +22,10 @@ from services.domain.models import (
     JobSpec,
     Lease,
     LeaseProgress,
+    PlannedShard,
     Renewal,
     Shard,
+    ShardDigest,
     ShardPlan,
     VideoRef,
     VideoResult,
@@ -279,6 +281,12 @@ class Store(Protocol):
     def list_shards(
         self, job_id: str, *, tenant: str | None = None, limit: int = 100, after: str | None = None
     ) -> tuple[list[Shard], str | None]: ...
+
+    def planned_shards(self, job_id: str, *, first_ordinal: int = 0, limit: int = 1000) -> list[PlannedShard]:
+        """What the plan says about the shards from an ordinal on, in their order."""
+
+    def shard_digests(self, job_id: str, *, first_ordinal: int = 0, limit: int = 1000) -> list[ShardDigest]:
+        """What is known of the records of the shards from an ordinal on, in their order. Raises JobNotFound."""
 
     def uncommitted_shards(self, job_id: str) -> list[Shard]:
         """Shards that are not committed, for the reconciler that compares with the records in object storage."""

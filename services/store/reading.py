@@ -13,7 +13,9 @@ from services.domain.models import (
     Job,
     JobProgress,
     JobSpec,
+    PlannedShard,
     Shard,
+    ShardDigest,
     VideoRef,
     VideoResult,
 )
@@ -134,6 +136,32 @@ def uncommitted_shards(tx: Tx, job_id: str) -> list[Shard]:
     """See `Store.uncommitted_shards`."""
     query = select(shards).where(shards.c.job_id == job_id, shards.c.state != ShardState.COMMITTED.value)
     return [_shard(row) for row in tx.rows(query.order_by(shards.c.ordinal))]
+
+
+def planned_shards(tx: Tx, job_id: str, first_ordinal: int, limit: int) -> list[PlannedShard]:
+    """See `Store.planned_shards`."""
+    query = select(shards.c.id, shards.c.ordinal, shards.c.plan_hash).where(
+        shards.c.job_id == job_id, shards.c.ordinal >= first_ordinal
+    )
+    rows = tx.rows(query.order_by(shards.c.ordinal).limit(limit))
+    keys: dict[str, list[str]] = {row.id: [] for row in rows}
+    of_them = select(videos.c.shard_id, videos.c.key).where(videos.c.shard_id.in_(list(keys)))
+    for video in tx.rows(of_them.order_by(videos.c.shard_id, videos.c.position)):
+        keys[video.shard_id].append(video.key)
+    return [PlannedShard(row.ordinal, row.plan_hash, tuple(keys[row.id])) for row in rows]
+
+
+def shard_digests(tx: Tx, job_id: str, first_ordinal: int, limit: int) -> list[ShardDigest]:
+    """See `Store.shard_digests`."""
+    _require_job(tx, job_id, None)
+    c = shards.c
+    query = select(c.id, c.ordinal, c.state, c.plan_hash, c.record_sha256).where(
+        c.job_id == job_id, c.ordinal >= first_ordinal
+    )
+    return [
+        ShardDigest(row.id, row.ordinal, ShardState(row.state), row.plan_hash, row.record_sha256)
+        for row in tx.rows(query.order_by(c.ordinal).limit(limit))
+    ]
 
 
 def list_events(tx: Tx, job_id: str, tenant: str | None, after_seq: int, limit: int) -> list[Event]:

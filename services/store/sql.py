@@ -20,8 +20,10 @@ from services.domain.models import (
     JobSpec,
     Lease,
     LeaseProgress,
+    PlannedShard,
     Renewal,
     Shard,
+    ShardDigest,
     ShardPlan,
 )
 from services.domain.redaction import redact
@@ -235,6 +237,12 @@ class SqlStore:
         self, job_id: str, *, tenant: str | None = None, limit: int = 100, after: str | None = None
     ) -> tuple[list[Shard], str | None]:
         return self._db.read(lambda tx: reading.list_shards(tx, job_id, tenant, limit, after))
+
+    def planned_shards(self, job_id: str, *, first_ordinal: int = 0, limit: int = 1000) -> list[PlannedShard]:
+        return self._db.read(lambda tx: reading.planned_shards(tx, job_id, first_ordinal, limit))
+
+    def shard_digests(self, job_id: str, *, first_ordinal: int = 0, limit: int = 1000) -> list[ShardDigest]:
+        return self._db.read(lambda tx: reading.shard_digests(tx, job_id, first_ordinal, limit))
 
     def uncommitted_shards(self, job_id: str) -> list[Shard]:
         return self._db.read(lambda tx: reading.uncommitted_shards(tx, job_id))

@@ -90,6 +90,27 @@ def test_a_slot_on_which_everything_dies_is_fenced_and_blames_nobody_for_good(ri
     assert rig.record(live) is None
 
 
+def test_where_only_one_video_died_another_slot_is_asked(rig: Rig) -> None:
+    """It may be the slot: before its last try the video goes to whoever claims the shard next."""
+    rig.job({"lonely": "die"})
+    live = rig.lease()
+    outcome = rig.supervisor.work(live)
+    assert (outcome.kind, outcome.reason, outcome.fenced) == ("given_back", "worker_died", False)
+    assert rig.slot.annotated() == ["lonely", "lonely"]
+    rig.slot.where = "elsewhere/slot-0"
+    live = rig.lease()
+    assert rig.supervisor.work(live).kind == "committed"
+    assert rig.rows(live)["lonely"].status is VideoStatus.QUARANTINED
+
+
+def test_a_bad_slot_is_fenced_before_it_condemns_one_of_two(rig: Rig) -> None:
+    rig.job(dict.fromkeys("ab", "die"))
+    live = rig.lease()
+    assert rig.supervisor.work(live).fenced
+    assert rig.slot.annotated() == ["a", "b", "a"]
+    assert rig.record(live) is None
+
+
 def test_a_fenced_slot_that_is_pardoned_ends_the_job_after_all(rig: Rig) -> None:
     rig.job(dict.fromkeys("abcd", "die"))
     for _ in range(20):

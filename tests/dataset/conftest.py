@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 import uuid
 from collections.abc import Callable
@@ -11,8 +12,9 @@ import boto3
 import pytest
 from shard_factory import ATTRIBUTES, JOB, commit_shard, failure, make_lease, success, write_artifacts
 
+from services.commit import publish_plan
 from services.dataset import finalise
-from services.domain.models import JobSpec
+from services.domain.models import JobSpec, PlannedShard
 from services.storage import DirectoryStore, ObjectStore, S3Store
 
 FRAMES = {"cat-1": 3, "ant-2": 2, "dog-3": 4}
@@ -30,12 +32,21 @@ def engine_output(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def commit_all(store: ObjectStore, engine_output: Path, tmp_path: Path) -> None:
     """Three shards: one mixed, one without any success, one with a single video."""
+    begin(store)
     artifacts = shutil.copytree(engine_output, tmp_path / "artifacts")
     for ordinal, keys in enumerate(SHARDS):
         results = [
             success(k, FRAMES[k]) if k in FRAMES else failure(k, quarantined=k.startswith("poison")) for k in keys
         ]
         commit_shard(make_lease(keys, ordinal=ordinal), results, artifacts, tmp_path / "s", store, lambda: True)
+
+
+def begin(store: ObjectStore) -> None:
+    """What the planner leaves in an output."""
+    leases = [make_lease(keys, ordinal=ordinal) for ordinal, keys in enumerate(SHARDS)]
+    planned = [PlannedShard(x.ordinal, x.plan_hash, tuple(v.key for v in x.videos)) for x in leases]
+    store.create("_job.json", json.dumps({"schema_version": 1, "job_id": JOB}).encode())
+    publish_plan(store, JOB, SPEC.config_hash, lambda first: planned[first:], len(planned))
 
 
 @pytest.fixture
