@@ -7,7 +7,7 @@ export OMP_WAIT_POLICY ?= passive
 # Ray and matplotlib must not phone home or open windows.
 export RAY_USAGE_STATS_ENABLED := 0
 
-.PHONY: demo test setup lint types unit lock format clean
+.PHONY: demo test setup lint types unit chaos lock format clean
 
 $(VENV)/.runtime: pyproject.toml requirements.lock scripts/setup.sh
 	@scripts/setup.sh
@@ -34,6 +34,11 @@ types: setup
 
 unit: setup
 	$(VENV)/bin/python -m pytest --numprocesses $(TEST_PROCESSES) --dist worksteal $(PYTEST_ARGS)
+
+SEED ?= 1
+MINUTES ?= 5
+chaos: setup ## a job of 64 videos while everything around it breaks; SEED=2 MINUTES=3 for another run
+	$(VENV)/bin/python -m benchmarks.chaos --seed $(SEED) --minutes $(MINUTES)
 
 format: setup
 	$(VENV)/bin/ruff check --fix .

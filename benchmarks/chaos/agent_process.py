@@ -17,7 +17,7 @@ from services.agent.config import AgentConfig
 from services.agent.ray_executor import RayExecutor
 from services.observability.logging import configure_logging
 from services.observability.metrics import Metrics
-from services.store.sql import SqlStore
+from services.store.sql import open_when_ready
 
 LEASE_TTL_S = 12.0
 VIDEO_BUDGET_S = 30.0
@@ -42,7 +42,7 @@ def main(database_url: str, scratch: Path) -> None:
         recycle_videos=12,
         s3_endpoint_url=os.environ["VIPE_S3_ENDPOINT_URL"],
     )
-    store = SqlStore(database_url)
+    store = open_when_ready(database_url)
     agent = Agent(store, config, RayExecutor(config), Metrics())
     agent.start()
     print(f"agent {os.environ[AGENT_VARIABLE]} is {agent.holder}", flush=True)

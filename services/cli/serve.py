@@ -115,10 +115,10 @@ def _metrics() -> Metrics:
 
 @contextlib.contextmanager
 def _open_store(settings: Settings) -> Iterator[SqlStore]:
-    from services.store.sql import SqlStore
+    from services.store.sql import open_when_ready
 
     settings.data_dir.mkdir(parents=True, exist_ok=True)
-    store = SqlStore(settings.database_url)
+    store = open_when_ready(settings.database_url)
     try:
         yield store
     finally:

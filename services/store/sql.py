@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import hashlib
 import json
+import logging
+import time
 from collections.abc import Iterable, Sequence
 from functools import partial
 
@@ -11,6 +13,7 @@ from pydantic import TypeAdapter
 from sqlalchemy import select
 
 from services.domain.access import ALL_SCOPES, DEFAULT_TENANT, ApiKey, AuditEntry, AuditEvent, Scope
+from services.domain.errors import StoreUnavailable
 from services.domain.keys import hash_key, new_key
 from services.domain.models import (
     CommitRecord,
@@ -34,6 +37,26 @@ from services.store.database import Database, Tx
 
 # The answer to a repeated request is a job as it was; a field that a later release adds has its default then.
 _JOBS = TypeAdapter(Job)
+
+
+_log = logging.getLogger(__name__)
+
+
+def open_when_ready(url: str, patience_s: float = 60.0) -> SqlStore:
+    """A store, as soon as its database answers: services of one host start together, and databases restart.
+
+    Raises:
+        StoreUnavailable: It does not answer within `patience_s`.
+    """
+    deadline = time.monotonic() + patience_s
+    while True:
+        try:
+            return SqlStore(url)
+        except StoreUnavailable as error:
+            if time.monotonic() >= deadline:
+                raise
+            _log.warning("waiting for the database: %s", error)
+            time.sleep(1.0)
 
 
 class SqlStore:

@@ -16,7 +16,7 @@ from services.domain.errors import StoreUnavailable
 from services.store import migrations
 from services.store.database import Database
 from services.store.schema import metadata
-from services.store.sql import SqlStore
+from services.store.sql import SqlStore, open_when_ready
 
 
 def _indexes(database: Database) -> set[str]:
@@ -115,6 +115,26 @@ def test_addresses_that_are_not_supported(url: str) -> None:
 def test_a_database_that_does_not_answer(tmp_path: Path, url: str) -> None:
     with pytest.raises(StoreUnavailable, match="does not answer"):
         SqlStore(url.format(tmp=tmp_path))
+
+
+def test_a_database_that_comes_up_late_is_waited_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    url, tries = f"sqlite:///{tmp_path}/late.db", []
+    upgrade = SqlStore.upgrade
+
+    def late(store: SqlStore) -> None:
+        tries.append(1)
+        if len(tries) < 3:
+            raise StoreUnavailable("the database is starting up")
+        upgrade(store)
+
+    monkeypatch.setattr(SqlStore, "upgrade", late)
+    monkeypatch.setattr("services.store.sql.time.sleep", lambda seconds: None)
+    store = open_when_ready(url)
+    store.ping()
+    store.close()
+    tries.clear()
+    with pytest.raises(StoreUnavailable):
+        open_when_ready(url, patience_s=0.0)
 
 
 def test_two_stores_share_nothing(new_store_url: Callable[[], str]) -> None:
