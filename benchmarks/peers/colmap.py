@@ -156,7 +156,7 @@ def _read(folder: Path, mapper: str) -> ColmapRun:
     index, poses, camera = np.zeros(0, np.int64), np.zeros((0, 4, 4)), None
     failure = facts["failure"]
     if failure is None:
-        with np.load(folder / f"{mapper}.npz") as file:
+        with np.load(folder / f"{mapper}.npz", allow_pickle=False) as file:
             index, poses, params = file["index"], file["world_from_cam"], file["params"]
         if len(index):
             width, height = facts["size"]

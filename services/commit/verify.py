@@ -7,9 +7,8 @@ import tarfile
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
-from webdataset.tariterators import base_plus_ext
-
 from services.commit.layout import MEMBERS
+from services.commit.tar_reader import check_member
 from services.commit.tar_writer import WrittenTar
 from services.domain.errors import IntegrityError
 from services.domain.models import Attribute
@@ -35,9 +34,7 @@ def index_tar(path: Path) -> Members:
     try:
         with tarfile.open(path, "r:") as tar:
             for info in tar:
-                key, extension = base_plus_ext(info.name)
-                if not info.isfile() or not key or not extension or "/" in info.name:
-                    raise IntegrityError(f"{path.name} holds {info.name!r}, which is not a member of a sample")
+                key, _ = check_member(info, path.name)
                 if info.offset_data + info.size > size_bytes:
                     raise IntegrityError(f"{path.name} is cut short in {info.name}")
                 if key != current and key in index:
@@ -47,7 +44,7 @@ def index_tar(path: Path) -> Members:
                     raise IntegrityError(f"{path.name} holds {info.name} twice")
                 files[info.name] = (info.offset_data, info.size)
                 current = key
-    except (tarfile.TarError, EOFError) as error:
+    except (tarfile.TarError, EOFError, ValueError, OverflowError, RecursionError) as error:
         raise IntegrityError(f"{path.name} is not a readable tar: {error}") from error
     return index
 

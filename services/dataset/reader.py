@@ -4,18 +4,18 @@ from __future__ import annotations
 
 import io
 import tempfile
-import zipfile
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
-from webdataset.tariterators import group_by_keys, tar_file_iterator
+from webdataset.tariterators import group_by_keys
 
 from services.commit.layout import ATTRIBUTES, MEMBERS, REQUIRED, payload_key
+from services.commit.tar_reader import read_members
 from services.dataset.index import DatasetIndex, Row
 from services.dataset.schema import member_column
 from services.domain.errors import IntegrityError, ObjectMissing
@@ -26,7 +26,7 @@ from services.storage.open import open_store
 from vipe_core.annotation import DepthKind
 from vipe_core.cameras import Camera
 from vipe_core.errors import FormatError
-from vipe_core.formats import decode_depth, read_artifacts
+from vipe_core.formats import DepthZipReader, read_artifacts
 
 _READ_AHEAD_BYTES = 8 << 20
 
@@ -75,13 +75,10 @@ class Sample:
         data = self.files.get("depth", {}).get("zip")
         if data is None:
             raise FormatError(f"{self.key}: its depth was not read; ask for the attribute `depth`")
-        try:
-            with zipfile.ZipFile(io.BytesIO(data)) as archive:
-                for index in range(self.num_frames):
-                    name = f"{index:05d}.exr"
-                    yield decode_depth(archive.read(name), f"{self.key}.zip:{name}")
-        except (KeyError, zipfile.BadZipFile) as error:
-            raise FormatError(f"{self.key}.zip: a depth map is missing or damaged") from error
+        with DepthZipReader(io.BytesIO(data), label=f"{self.key}.zip") as archive:
+            if len(archive) != self.num_frames:
+                raise FormatError(f"{self.key}.zip: {len(archive)} depth maps for {self.num_frames} poses")
+            yield from archive
 
 
 def iterate(source: ObjectStore | str, attributes: Sequence[Attribute] | None = None) -> Iterator[Sample]:
@@ -172,8 +169,7 @@ def _lockstep(store: ObjectStore, tar_name: str, attributes: Sequence[Attribute]
         for attribute in attributes:
             key = payload_key(tar_name, attribute)
             file = stack.enter_context(open_object(store, key, buffer_bytes=_READ_AHEAD_BYTES))
-            members = ({"__url__": key, **member} for member in tar_file_iterator(file))
-            streams.append(group_by_keys(members))
+            streams.append(group_by_keys(_webdataset_members(file, key)))
         try:
             for samples in zip(*streams, strict=True):
                 keys = {sample["__key__"] for sample in samples}
@@ -188,6 +184,14 @@ def _lockstep(store: ObjectStore, tar_name: str, attributes: Sequence[Attribute]
                 )
         except ValueError as error:
             raise IntegrityError(f"the tars of {tar_name} do not hold the same number of samples") from error
+
+
+def _webdataset_members(file: BinaryIO, key: str) -> Iterator[dict[str, Any]]:
+    for info, _, _, data in read_members(file, key):
+        content = data.read()
+        if len(content) != info.size:
+            raise IntegrityError(f"{key} ends inside {info.name}")
+        yield {"__url__": key, "fname": info.name, "data": content}
 
 
 def _sample(key: str, files: Files, row: Row) -> Sample:

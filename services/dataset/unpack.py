@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 import shutil
-import tarfile
-from collections.abc import Collection, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import BinaryIO, Literal, cast
-
-from webdataset.tariterators import base_plus_ext
+from typing import BinaryIO, Literal
 
 from services.commit.layout import ATTRIBUTES, MEMBERS, payload_key
+from services.commit.tar_reader import read_members, split_name
 from services.dataset.index import DatasetIndex
 from services.dataset.reader import member_ranges
 from services.domain.errors import IntegrityError, ObjectMissing
@@ -103,49 +100,22 @@ class _Target:
         self.size_bytes += size
 
     def _path(self, attribute: Attribute, name: str) -> Path:
-        key, extension = split_member(attribute, name)
+        key, extension = split_name(name, f"{attribute}.tar")
         for member in MEMBERS[attribute]:
             if member.extension == extension:
                 return member.path(self._dest, self._names[key])
         raise IntegrityError(f"{attribute}.tar holds {name!r}, which does not belong there")
 
 
-def split_member(attribute: Attribute, name: str) -> tuple[str, str]:
-    """(key, extension) of a member.
-
-    Raises:
-        IntegrityError: A name with a folder, or none that webdataset takes.
-    """
-    key, extension = base_plus_ext(name)
-    if not key or not extension or "/" in name or "\\" in name:
-        raise IntegrityError(f"{attribute}.tar holds {name!r}, which does not belong there")
-    return key, extension
-
-
 def _unpack_tar(store: ObjectStore, key: str, attribute: Attribute, keys: set[str], target: _Target) -> None:
     found: set[str] = set()
-    with _opened(store, key) as tar:
-        for info in tar:
-            if not info.isfile():
-                raise IntegrityError(f"{key} holds {info.name!r}, which is not a file")
-            sample = split_member(attribute, info.name)[0]
+    with open_object(store, key, buffer_bytes=_READ_AHEAD_BYTES) as file:
+        for info, sample, _, data in read_members(file, key):
             if sample in keys:
-                target.write(attribute, info.name, cast(BinaryIO, tar.extractfile(info)), info.size)
+                target.write(attribute, info.name, data, info.size)
                 found.add(sample)
     if missing := sorted(keys - found):
         raise IntegrityError(f"{key} does not hold {missing[0]}, although the index says so")
-
-
-@contextmanager
-def _opened(store: ObjectStore, key: str) -> Iterator[tarfile.TarFile]:
-    try:
-        with (
-            open_object(store, key, buffer_bytes=_READ_AHEAD_BYTES) as file,
-            tarfile.open(fileobj=file, mode="r|*") as tar,
-        ):
-            yield tar
-    except tarfile.TarError as error:
-        raise IntegrityError(f"{key} is not a readable tar: {error}") from error
 
 
 def _present(store: ObjectStore, tar_name: str, wanted: Sequence[Attribute] | None) -> tuple[Attribute, ...]:

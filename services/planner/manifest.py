@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from typing import Any, BinaryIO
 
 from services.domain.errors import InputTooLarge, InvalidManifest
+from services.inputs.parquet_rows import parquet_rows
 
 SUFFIXES = (".csv", ".jsonl", ".ndjson", ".parquet")
 
@@ -23,9 +24,6 @@ _KEY = re.compile(r"[a-z0-9][a-z0-9_-]{0,79}")
 _MAX_LINE_BYTES = 1 << 20
 _MAX_URI = 2048
 _MAX_ETAG = 256
-_BATCH_ROWS = 1000
-# Of one column of one row group: what reading it must hold at once.
-_MAX_COLUMN_BYTES = 1 << 29
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,7 +49,7 @@ def read_manifest(file: BinaryIO, name: str, *, max_rows: int) -> Iterator[Row]:
     """The rows of a list.
 
     Args:
-        file: Seekable.
+        file: An open file of the operating system where it is a parquet file: another process reads it.
         name: Of the list; its suffix decides how it is read, messages begin with it.
 
     Raises:
@@ -135,27 +133,11 @@ def _json_rows(file: BinaryIO, name: str) -> Iterator[Mapping[str, Any]]:
 
 
 def _parquet_rows(file: BinaryIO, name: str) -> Iterator[Mapping[str, Any]]:
-    import pyarrow as pa
-    import pyarrow.parquet as pq
-
-    try:
-        with pq.ParquetFile(file) as table:
-            names = table.schema_arrow.names
-            _check_columns(name, names)
-            wanted = [column for column in _COLUMNS if column in names]
-            metadata = table.metadata
-            for group in range(metadata.num_row_groups):
-                row_group = metadata.row_group(group)
-                for column in range(row_group.num_columns):
-                    chunk = row_group.column(column)
-                    if chunk.path_in_schema in wanted and chunk.total_uncompressed_size > _MAX_COLUMN_BYTES:
-                        raise InputTooLarge(
-                            f"{name}: the column {chunk.path_in_schema!r} is too large; use more row groups"
-                        )
-            for batch in table.iter_batches(_BATCH_ROWS, columns=wanted, use_threads=False):
-                yield from batch.to_pylist()
-    except (pa.ArrowException, OSError, ValueError) as error:
-        raise InvalidManifest(f"{name} is not a readable parquet file") from error
+    for row in parquet_rows(file, name, _COLUMNS):
+        if isinstance(row, list):
+            _check_columns(name, row)
+        else:
+            yield row
 
 
 def _check_columns(name: str, columns: list[str]) -> None:

@@ -14,6 +14,9 @@ from vipe_core.errors import FormatError
 CHANNEL = "Z"
 # Largest finite half; a far value is kept as far instead of becoming infinite.
 MAX_DEPTH = 65504.0
+# As large as a picture may be by default (`vipe_core.video.Limits`).
+MAX_PIXELS = 1 << 26
+MAX_SIDE_PX = 1 << 16
 # Smallest half with full precision is 6e-5; anything below the smallest positive half would read back as "no value".
 _MIN_DEPTH = 2.0**-24
 
@@ -53,8 +56,14 @@ def decode_depth(data: bytes, label: str = "depth map") -> NDArray[np.float32]:
         path = Path(folder, "depth.exr")
         path.write_bytes(data)
         try:
+            header = OpenEXR.File(str(path), header_only=True).header()
+            low, high = (np.asarray(corner, dtype=np.int64) for corner in header["dataWindow"])
+            width, height = (int(side) for side in high - low + 1)
+            # The library makes room for what the header claims before it looks for the pixels.
+            if not (0 < width <= MAX_SIDE_PX and 0 < height <= MAX_SIDE_PX and width * height <= MAX_PIXELS):
+                raise FormatError(f"{label}: a depth map of {width}x{height} pixels exceeds what is read")
             channels = OpenEXR.File(str(path)).channels()
-        except (RuntimeError, ValueError, TypeError, OSError) as error:
+        except (RuntimeError, ValueError, TypeError, OSError, KeyError, MemoryError) as error:
             raise FormatError(f"{label}: not a readable EXR image; write the artifact again") from error
     if CHANNEL not in channels:
         raise FormatError(f"{label}: the EXR image has no channel {CHANNEL!r}, only {sorted(channels)}")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import lzma
 import re
 import zipfile
 import zlib
@@ -9,7 +10,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from pathlib import Path
 from types import TracebackType
-from typing import Any, ClassVar, Generic, Self, TypeVar
+from typing import IO, Any, ClassVar, Generic, Self, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -88,13 +89,14 @@ class FrameZipReader(_FrameZip, ABC, Generic[Pixel]):
     kind: ClassVar[str]
     max_bytes: ClassVar[int]
 
-    def __init__(self, path: str | Path) -> None:
-        self._name = Path(path).name
+    def __init__(self, source: str | Path | IO[bytes], label: str | None = None) -> None:
+        """Open a file, or bytes that messages call `label`."""
+        self._name = label or (Path(source).name if isinstance(source, (str, Path)) else "archive")
         try:
-            self._zip = zipfile.ZipFile(path)
+            self._zip = zipfile.ZipFile(source)
         except FileNotFoundError as error:
             raise FormatError(f"{self._name}: no such archive of {self.kind}s") from error
-        except (OSError, zipfile.BadZipFile) as error:
+        except (OSError, zipfile.BadZipFile, ValueError, NotImplementedError, EOFError) as error:
             raise FormatError(f"{self._name}: not a readable zip; write the artifact again") from error
         try:
             self._members = self._checked_members()
@@ -124,7 +126,7 @@ class FrameZipReader(_FrameZip, ABC, Generic[Pixel]):
             raise FormatError(f"{label}: {member.file_size} bytes are no {self.kind}")
         try:
             data = self._zip.read(member)
-        except (zipfile.BadZipFile, zlib.error, OSError, EOFError, ValueError, RuntimeError) as error:
+        except (zipfile.BadZipFile, zlib.error, OSError, EOFError, ValueError, RuntimeError, lzma.LZMAError) as error:
             raise FormatError(f"{label}: the member is damaged; write the artifact again") from error
         return self._decoded(data, label)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from typing import Any
 
 import cv2
@@ -9,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vipe_core.errors import FormatError
+from vipe_core.formats.exr import MAX_PIXELS
 from vipe_core.formats.frame_zip import FrameZipReader, FrameZipWriter
 
 _PNG_LEVEL = 3
@@ -80,7 +82,13 @@ def _png(picture: NDArray[Any], strategy: int = cv2.IMWRITE_PNG_STRATEGY_DEFAULT
 
 
 def _picture(data: bytes, label: str) -> NDArray[np.uint8]:
-    picture = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), cv2.IMREAD_UNCHANGED) if data else None
+    width, height = struct.unpack(">II", data[16:24]) if len(data) > 24 else (0, 0)
+    if width * height > MAX_PIXELS:
+        raise FormatError(f"{label}: a picture of {width}x{height} pixels exceeds what is read")
+    try:
+        picture = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), cv2.IMREAD_UNCHANGED) if data else None
+    except cv2.error:
+        picture = None
     if picture is None or picture.dtype != np.uint8 or picture.ndim != 2:
         raise FormatError(f"{label}: not an 8-bit picture of one channel")
     return np.asarray(picture, dtype=np.uint8)

@@ -24,6 +24,9 @@ from vipe_core.video.probe import probe
 
 Reader = TypeVar("Reader", bound=FrameZipReader[Any])
 
+# Ten million poses.
+_MAX_ARRAY_BYTES = 10_000_000 * 16 * 8
+
 _MODELS: dict[str, tuple[CameraModel, int]] = {
     "PINHOLE": ("pinhole", 4),
     "MEI": ("mei", 5),
@@ -114,12 +117,12 @@ def read_artifacts(root: str | Path, name: str) -> Artifacts:
         FormatError: A file is missing or does not hold what it must; names the file.
     """
     root = Path(root)
-    poses, inds = _read_npz(artifact_path(root, name, "pose", "npz"))
+    poses, inds = read_npz(artifact_path(root, name, "pose", "npz"))
     if poses.ndim != 3 or poses.shape[1:] != (4, 4) or len(poses) == 0:
         raise FormatError(f"pose/{name}.npz: `data` has shape {poses.shape}, (N, 4, 4) is needed")
     if not np.isfinite(poses).all() or np.abs(poses[:, 3] - (0, 0, 0, 1)).max() > 1e-4:
         raise FormatError(f"pose/{name}.npz: `data` holds matrices that are not rigid transforms")
-    intrinsics, intrinsics_inds = _read_npz(artifact_path(root, name, "intrinsics", "npz"))
+    intrinsics, intrinsics_inds = read_npz(artifact_path(root, name, "intrinsics", "npz"))
     if not np.array_equal(inds, intrinsics_inds):
         raise FormatError(f"intrinsics/{name}.npz: its frames are not those of pose/{name}.npz")
     info = _read_info(info_path(root, name), len(poses))
@@ -146,16 +149,24 @@ def read_artifacts(root: str | Path, name: str) -> Artifacts:
     )
 
 
-def _read_npz(path: Path) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+def read_npz(path: Path) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """`data` (N, ...) and `inds` (N,) of a file of poses or intrinsics.
+
+    Raises:
+        FormatError: It is missing or does not hold them; names the file.
+    """
     label = f"{path.parent.name}/{path.name}"
     if not path.is_file():
         raise FormatError(f"{label}: no such file; is the sequence name right?")
     try:
+        with zipfile.ZipFile(path) as archive:
+            if any(member.file_size > _MAX_ARRAY_BYTES for member in archive.infolist()):
+                raise FormatError(f"{label}: an array of more than {_MAX_ARRAY_BYTES} bytes is no list of frames")
         with np.load(path, allow_pickle=False) as file:
             data, inds = file["data"], file["inds"]
     except KeyError as error:
         raise FormatError(f"{label}: `data` and `inds` are needed, {error.args[0]}") from error
-    except (OSError, ValueError, EOFError, zlib.error, zipfile.BadZipFile) as error:
+    except (OSError, ValueError, EOFError, MemoryError, RuntimeError, zlib.error, zipfile.BadZipFile) as error:
         raise FormatError(f"{label}: not a readable npz; write the artifact again") from error
     if data.dtype.kind != "f" or inds.dtype.kind not in "iu" or inds.shape != data.shape[:1]:
         raise FormatError(f"{label}: `data` must be real numbers with one integer in `inds` per row")

@@ -104,10 +104,17 @@ def open_video(media: OpenedMedia, limits: Limits) -> tuple[InputContainer, Vide
     if len(container.streams) >= limits.max_streams:
         container.close()
         raise MediaTooLarge(f"{label}: the file holds {limits.max_streams} streams or more; keep only the video")
-    streams = [stream for stream in container.streams.video if not _is_cover(stream)]
-    if not streams:
-        name = container.format.name
+    pictures = [stream for stream in container.streams.video if not _is_cover(stream)]
+    # A stream of a codec that is not known here has no decoder, whatever its type says.
+    streams = [stream for stream in pictures if _has_decoder(stream)]
+    if pictures and not streams:
         container.close()
+        raise UnsupportedMedia(f"{label}: the codec of the video stream is not known here; re-encode it as h264")
+    if not streams:
+        name, empty = container.format.name, not container.streams
+        container.close()
+        if empty:
+            raise CorruptMedia(f"{label}: the container holds no stream at all; check that the upload is complete")
         if name in ("mp3", "aac") and not _starts_like_mpeg_audio(media):
             # Probing by content takes arbitrary bytes for MPEG audio now and then.
             raise CorruptMedia(f"{label}: not a media file; check that the upload is complete")
@@ -358,6 +365,11 @@ def _timestamp_s(frame: VideoFrame) -> float | None:
 def _is_cover(stream: VideoStream) -> bool:
     disposition: Any = stream.disposition
     return bool(disposition & type(disposition).attached_pic)
+
+
+def _has_decoder(stream: VideoStream) -> bool:
+    context: Any = stream.codec_context
+    return context is not None
 
 
 def _fps(stream: VideoStream) -> float:
