@@ -111,10 +111,12 @@ def open_video(media: OpenedMedia, limits: Limits) -> tuple[InputContainer, Vide
         container.close()
         raise UnsupportedMedia(f"{label}: the codec of the video stream is not known here; re-encode it as h264")
     if not streams:
-        name, empty = container.format.name, not container.streams
+        name = container.format.name
+        known = any(stream.type in ("audio", "subtitle") for stream in container.streams)
         container.close()
-        if empty:
-            raise CorruptMedia(f"{label}: the container holds no stream at all; check that the upload is complete")
+        if not known and not pictures:
+            # An index that is cut short leaves streams of no kind.
+            raise CorruptMedia(f"{label}: the file holds nothing that is known; check that the upload is complete")
         if name in ("mp3", "aac") and not _starts_like_mpeg_audio(media):
             # Probing by content takes arbitrary bytes for MPEG audio now and then.
             raise CorruptMedia(f"{label}: not a media file; check that the upload is complete")
