@@ -7,7 +7,7 @@ export OMP_WAIT_POLICY ?= passive
 # Ray and matplotlib must not phone home or open windows.
 export RAY_USAGE_STATS_ENABLED := 0
 
-.PHONY: demo test setup lint types unit chaos lock format clean
+.PHONY: demo test setup lint types unit chaos lock format audit fuzz clean
 
 $(VENV)/.runtime: pyproject.toml requirements.lock scripts/setup.sh
 	@scripts/setup.sh
@@ -46,6 +46,12 @@ format: setup
 
 lock: ## resolve all dependencies anew into requirements.lock
 	scripts/lock.sh
+
+audit: setup ## known vulnerabilities of the locked versions, and licences
+	@scripts/audit.sh
+
+fuzz: setup ## damaged bytes for every reader of bytes from outside, for half an hour
+	$(VENV)/bin/python -m benchmarks.fuzz --minutes 30
 
 clean: ## remove the environment, caches and the demo's output, nothing of yours
 	rm -rf $(VENV) .cache .mypy_cache .ruff_cache .import_linter_cache .pytest_cache .hypothesis vipe_output/demo

@@ -46,10 +46,13 @@ def annotate(
     """
     from rich.console import Console
 
+    from services.agent.config import media_limits
+    from services.settings import Settings
     from vipe_core.depth.known import KnownLength
     from vipe_core.errors import ConfigError, VipeError
     from vipe_core.formats import SequenceNames
     from vipe_core.pipeline.annotator import Annotator
+    from vipe_core.video.limits import use_limits
 
     if masks is not None and len(inputs) > 1:
         raise typer.BadParameter(f"the masks are of one input, not of {len(inputs)}", param_hint="--masks")
@@ -58,6 +61,7 @@ def annotate(
             KnownLength.parse(scale_from)
         except ConfigError as error:
             raise typer.BadParameter(str(error), param_hint="--scale-from") from error
+    use_limits(media_limits(Settings()))
     console = Console(stderr=True, quiet=as_json)
     annotator = Annotator(preset=preset, camera=camera, device=device)
     names = SequenceNames(output)

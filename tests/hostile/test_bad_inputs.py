@@ -23,7 +23,7 @@ def test_messages(answers: list[Answer]) -> None:
     for answer in answers:
         assert answer.message.isprintable(), answer
         assert 20 < len(answer.message) < 400, answer
-        assert not re.search(r"Traceback|0x[0-9a-f]{6}|<class|hush", answer.message), answer
+        assert not re.search(r"Traceback| at 0x|<class|hush", answer.message), answer
 
 
 def test_the_page_is_current(answers: list[Answer]) -> None:

@@ -114,7 +114,7 @@ def open_video(media: OpenedMedia, limits: Limits) -> tuple[InputContainer, Vide
         name = container.format.name
         known = any(stream.type in ("audio", "subtitle") for stream in container.streams)
         container.close()
-        if not known and not pictures:
+        if not known:
             # An index that is cut short leaves streams of no kind.
             raise CorruptMedia(f"{label}: the file holds nothing that is known; check that the upload is complete")
         if name in ("mp3", "aac") and not _starts_like_mpeg_audio(media):
