@@ -10,6 +10,7 @@ from pydantic import Field, IPvAnyNetwork, SecretStr, field_validator, model_val
 from pydantic_settings import BaseSettings, SettingsConfigDict
 
 from services.network.addresses import NetworkPolicy
+from vipe_core.video.limits import Limits
 
 
 def _default_data_dir() -> Path:
@@ -186,3 +187,15 @@ class Settings(BaseSettings):
     @classmethod
     def _absolute_roots(cls, value: tuple[Path, ...]) -> tuple[Path, ...]:
         return tuple(root.expanduser().absolute() for root in value)
+
+    def media_limits(self) -> Limits:
+        """How large one video may be."""
+        return Limits(
+            max_pixels=self.max_pixels,
+            max_frames=self.max_frames,
+            max_duration_s=self.max_duration_s,
+            max_decoded_bytes=self.max_decoded_bytes,
+            max_file_bytes=self.max_input_bytes,
+            max_streams=self.max_streams,
+            max_memory_bytes=self.max_decoder_memory_bytes,
+        )

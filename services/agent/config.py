@@ -122,19 +122,6 @@ def input_rules(settings: Settings) -> InputRules:
     )
 
 
-def media_limits(settings: Settings) -> Limits:
-    """What the service's settings say about the size of a video."""
-    return Limits(
-        max_pixels=settings.max_pixels,
-        max_frames=settings.max_frames,
-        max_duration_s=settings.max_duration_s,
-        max_decoded_bytes=settings.max_decoded_bytes,
-        max_file_bytes=settings.max_input_bytes,
-        max_streams=settings.max_streams,
-        max_memory_bytes=settings.max_decoder_memory_bytes,
-    )
-
-
 def config_from_settings(settings: Settings) -> AgentConfig:
     """What the service's settings say about its agent."""
     slots = settings.num_slots
@@ -153,7 +140,7 @@ def config_from_settings(settings: Settings) -> AgentConfig:
         recycle_age_s=settings.recycle_age_s,
         recycle_growth_bytes=settings.recycle_growth_bytes,
         inputs=input_rules(settings),
-        media=media_limits(settings),
+        media=settings.media_limits(),
         output_roots=settings.output_roots,
         s3_endpoint_url=settings.s3_endpoint_url,
     )

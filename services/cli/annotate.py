@@ -46,8 +46,7 @@ def annotate(
     """
     from rich.console import Console
 
-    from services.agent.config import media_limits
-    from services.settings import Settings
+    from services.cli.settings import read_settings
     from vipe_core.depth.known import KnownLength
     from vipe_core.errors import ConfigError, VipeError
     from vipe_core.formats import SequenceNames
@@ -61,7 +60,7 @@ def annotate(
             KnownLength.parse(scale_from)
         except ConfigError as error:
             raise typer.BadParameter(str(error), param_hint="--scale-from") from error
-    use_limits(media_limits(Settings()))
+    use_limits(read_settings().media_limits())
     console = Console(stderr=True, quiet=as_json)
     annotator = Annotator(preset=preset, camera=camera, device=device)
     names = SequenceNames(output)

@@ -56,7 +56,8 @@ class Limits:
             )
         if duration_s is not None and duration_s > self.max_duration_s:
             raise MediaTooLarge(
-                f"{label}: {duration_s:.12g} s exceed the limit of {self.max_duration_s:.12g} s; cut the video into parts"
+                f"{label}: {duration_s:.12g} s exceed the limit of {self.max_duration_s:.12g} s; "
+                "cut the video into parts"
             )
 
     def check_decoded(self, label: str, num_frames: int, width: int, height: int) -> None:
