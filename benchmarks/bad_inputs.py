@@ -253,6 +253,7 @@ def _addresses(bench: _Bench) -> None:
         ("http://other.example/a.mp4", "a host that is not allowed", "address_refused"),
         ("http://media.example:22/", "a port that is not allowed", "address_refused"),
         ("http://user:hush@media.example/a.mp4", "credentials in a URL", "address_refused"),
+        ("http://media.example/a.mp4?X-Amz-Signature=hush", "a signed URL", "address_refused"),
         ("http://media.example\\@other.example/", "a URL that two parsers read differently", "address_refused"),
         ("http://127.0.0.1:8080/v1/jobs", "the service's own address", "address_refused"),
     ):

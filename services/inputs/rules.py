@@ -9,7 +9,8 @@ from fnmatch import fnmatchcase
 from pathlib import Path
 
 from services.domain.errors import AddressRefused, InputUnavailable, InvalidRequest
-from services.network.addresses import NetworkPolicy
+from services.domain.redaction import redact
+from services.network.addresses import NetworkPolicy, shown_url
 from services.storage.roots import lies_within
 from vipe_core.video.opened import opened_path
 
@@ -48,6 +49,8 @@ class InputRules:
             check_bucket(uri, self.buckets)
         elif uri.startswith(WEB_SCHEMES):
             self.network.endpoint(uri)
+            if redact(uri) != uri:
+                raise AddressRefused(f"the URL {shown_url(uri)} holds credentials, and the address of an input is kept")
         elif not uri.startswith("/"):
             raise InvalidRequest(
                 f"the input {uri[:200]!r} must be an absolute path, s3://bucket/key or http(s)://host/..."

@@ -168,7 +168,7 @@ def read(ref: VideoRef, allowed: InputRules, folder: Path) -> bytes:
 def test_a_web_input(web: Web, tmp_path: Path) -> None:
     web.pages["/a/clip.mp4"] = page(BODY, ETag='"e"')
     web.pages["/moved"] = redirect("/a/clip.mp4")
-    for url in (web.url("/a/clip.mp4?token=x"), web.url("/moved")):
+    for url in (web.url("/a/clip.mp4?v=1"), web.url("/moved")):
         assert read(VideoRef("k", url, 0, '"e"'), rules(), tmp_path) == BODY
     with pytest.raises(InputUnavailable, match="planned"):
         read(VideoRef("k", web.url("/a/clip.mp4"), 0, '"other"'), rules(), tmp_path)
