@@ -14,6 +14,7 @@ from services.agent.traffic import TrafficMetrics
 from services.domain.errors import CommitConflict, StorageError
 from services.domain.models import CommitRecord, Job, Lease
 from services.observability.metrics import Metrics
+from services.planner import write_plan
 from services.storage import ObjectStore, open_store
 from services.store.base import Store
 
@@ -35,6 +36,7 @@ class Committer:
         self._s3_endpoint_url = s3_endpoint_url
         self._lock = threading.Lock()
         self._outputs: dict[str, ObjectStore] = {}
+        self._planned: dict[str, int] = {}
 
     def output(self, uri: str) -> ObjectStore:
         """The output location; one client per location, kept."""
@@ -52,6 +54,7 @@ class Committer:
         from services.commit.protocol import write_decided, write_record
 
         output = self.output(lease.spec.output)
+        self._extend_plan(output, lease)
         try:
             if lease.create_once:
                 outcome = write_record(output, payload, lambda: self._store.holds(lease.shard_id, lease.fence))
@@ -122,6 +125,26 @@ class Committer:
         if missed:
             logger.info("found %d committed shards of %s that the database had missed", missed, job.id)
         return missed
+
+    def _extend_plan(self, output: ObjectStore, lease: Lease) -> None:
+        """A shard that was added to a plan that was complete, by a retry: the output must expect its record first."""
+        from services.commit.plan import read_plan
+
+        with self._lock:
+            planned = self._planned.get(lease.job_id, 0)
+        if lease.ordinal < planned:
+            return
+        head = read_plan(output, lease.job_id, lambda shard: None)
+        if not head.complete:  # Its planner is still at it.
+            return
+        planned = head.shards
+        if lease.ordinal >= planned:
+            write_plan(output, self._store, lease.job_id, lease.spec.config_hash)
+            planned = lease.ordinal + 1
+        with self._lock:
+            self._planned[lease.job_id] = planned
+            while len(self._planned) > _MAX_OPEN_OUTPUTS:
+                del self._planned[next(iter(self._planned))]
 
     @staticmethod
     def _put_decided(output: ObjectStore, job_id: str, decided: bytes | None) -> None:

@@ -107,7 +107,7 @@ class JobKeeper:
             scratch = self._config.scratch_dir / "finalise"
             scratch.mkdir(parents=True, exist_ok=True)
             output = self._committer.output(job.spec.output)
-            write_plan(output, self._store, job)  # A retry has added to it since it was planned.
+            write_plan(output, self._store, job.id, job.spec.config_hash)  # Earlier releases planned without it.
             finalise(
                 output,
                 job.id,

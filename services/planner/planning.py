@@ -175,14 +175,15 @@ def plan(
                 return
             if not turn.add(batch):
                 return
-        write_plan(output, turn.store, job, keep=turn.keep)
+        write_plan(output, turn.store, job.id, job.spec.config_hash, keep=turn.keep)
         turn.finish()
 
 
 def write_plan(
     output: ObjectStore,
     store: Store,
-    job: Job,
+    job_id: str,
+    config_hash: str,
     *,
     keep: Callable[[Iterable[PlannedShard]], Iterable[PlannedShard]] = iter,
 ) -> None:
@@ -198,14 +199,14 @@ def write_plan(
     from services.commit.plan import publish_plan  # Heavy packages stand behind its package.
 
     def shards_from(ordinal: int) -> Iterator[PlannedShard]:
-        while page := store.planned_shards(job.id, first_ordinal=ordinal, limit=_PAGE):
+        while page := store.planned_shards(job_id, first_ordinal=ordinal, limit=_PAGE):
             yield from keep(page)
             ordinal = page[-1].ordinal + 1
 
-    total = store.get_job(job.id).progress.shards_total
+    total = store.get_job(job_id).progress.shards_total
     if total:
-        create_once = store.commit_point(job.id) is not False
-        publish_plan(output, job.id, job.spec.config_hash, shards_from, total, create_once=create_once)
+        create_once = store.commit_point(job_id) is not False
+        publish_plan(output, job_id, config_hash, shards_from, total, create_once=create_once)
 
 
 def check_output_place(output: str, roots: Sequence[Path], buckets: tuple[str, ...] = ()) -> None:

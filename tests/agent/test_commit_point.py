@@ -14,12 +14,13 @@ from agent_rig import Rig
 
 from benchmarks.chaos.s3_proxy import S3Proxy
 from services.agent.jobs import JobKeeper
-from services.commit import committed_record, prepare_payload, tar_names, write_decided
+from services.commit import committed_record, prepare_payload, publish_plan, read_plan, tar_names, write_decided
 from services.dataset import verify
-from services.domain.models import Death, JobSpec
+from services.domain.models import Death, JobProgress, JobSpec, PlannedShard
 from services.domain.states import JobState, VideoStatus
 from services.planner import plan_next
 from services.storage import open_store
+from services.store.sql import SqlStore
 
 
 @pytest.fixture
@@ -138,6 +139,28 @@ def _dies_on_records(put_bytes):  # type: ignore[no-untyped-def]
         return put_bytes(self, key, data)
 
     return put
+
+
+def test_a_shard_that_joins_a_complete_plan_is_expected_before_its_record(rig: Rig) -> None:
+    """As a retry adds it. Until the index is made anew the job counts as running, and nothing as forged."""
+    job_id = rig.job({"a": "frames=2"})
+    live = rig.lease()
+    output = open_store(str(rig.root / "out"))
+    output.create("_job.json", f'{{"job_id": "{job_id}"}}'.encode())
+    ghost = PlannedShard(0, "0" * 64, ("gone",))
+    publish_plan(output, job_id, live.lease.spec.config_hash, lambda first: [ghost][first:], 1)
+    joined = replace(live.lease, ordinal=1)
+    rig.committer._store.planned_shards = (
+        lambda job, first_ordinal, limit: [  # type: ignore[method-assign]
+            PlannedShard(1, joined.plan_hash, ("a",))
+        ][first_ordinal - 1 :]
+    )
+    rig.committer._store.get_job = lambda job: replace(  # type: ignore[method-assign]
+        SqlStore.get_job(rig.store, job), progress=JobProgress(shards_total=2)
+    )
+    rig.committer._extend_plan(output, joined)
+    head = read_plan(output, job_id, lambda shard: None)
+    assert (head.pages, head.shards, head.complete) == (2, 2, True)
 
 
 def test_two_deaths_in_two_places_are_the_videos_fault(rig: Rig) -> None:
