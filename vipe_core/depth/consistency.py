@@ -20,6 +20,8 @@ Array = NDArray[Any]
 
 # A correlation of the first says nothing, of the second as much as it can.
 _MIN_SCORE, _SURE_SCORE = 0.2, 0.7
+# Of what no other frame contradicts: with one that agrees.
+_HALF_SCORE = 0.5
 # A margin over all other depths of the second says as much as it can. An answer without any rests on its neighbours.
 _LEAST_DISTINCT, _SURE_MARGIN = 0.1, 0.2
 # Of the frames that see a pixel, this share must agree, and at least so many; one for what correlates very well.
@@ -89,17 +91,17 @@ def confirm(
             ratios,
         )
     share = votes / np.maximum(asked - hidden, 1)
-    agreed = (asked > 0) & (share >= _MIN_SHARE)
-    moving = unrefuted(moving, agreed & (votes >= _SURE_VOTES))
-    believed = agreed & (votes >= np.where(moving, _SURE_VOTES, np.where(raw.score > _SURE_SCORE, 1, _MIN_VOTES)))
-    believed = _without_specks(value, believed)
     score = np.clip((raw.score - _MIN_SCORE) / (_SURE_SCORE - _MIN_SCORE), 0, 1)
     distinct = np.clip(raw.margin / _SURE_MARGIN, 0, 1)
-    belief = np.where(believed, share * score * np.maximum(distinct, _LEAST_DISTINCT), 0).astype(np.float32)
-    belief[belief < _MIN_BELIEF] = 0
+    belief = share * score * np.maximum(distinct, _LEAST_DISTINCT)
+    agreed = (asked > 0) & (share >= _MIN_SHARE) & (belief >= _MIN_BELIEF)
+    moving = unrefuted(moving, agreed & (votes >= _SURE_VOTES))
+    believed = agreed & (votes >= np.where(moving, _SURE_VOTES, np.where(raw.score > _SURE_SCORE, 1, _MIN_VOTES)))
+    belief = np.where(_without_specks(value, believed), belief, 0).astype(np.float32)
     # Nobody can be asked about what things hide from all others but those that agree. Nor about an answer that is far
     # too near: it counts for nothing without a margin, or outside of the range that is searched.
-    alone = (asked == 0) | ((votes == asked - hidden) & (raw.score > _SURE_SCORE))
+    enough = raw.score > np.where(votes > 0, _HALF_SCORE, _SURE_SCORE)
+    alone = (asked == 0) | ((votes == asked - hidden) & enough)
     alone &= ~moving & (value >= prior.low) & (value <= prior.high)
     weight = np.where(alone & (belief == 0), _LONE_BELIEF * score * distinct, belief) ** 2
     return Confirmed((value * (1 + ratios) / (1 + votes)).astype(np.float32), belief, weight.astype(np.float32), moving)
