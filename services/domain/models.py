@@ -20,7 +20,8 @@ class JobSpec:
     """What the user asked for.
 
     Attributes:
-        inputs: Each a directory, a video file, an `s3://bucket/key`, or an `s3://bucket/prefix/` (trailing slash).
+        inputs: Each a directory, a video file, `s3://bucket/key`, `s3://bucket/prefix/` (trailing slash),
+            `http(s)://host/path`, or a list of videos (`.csv`, `.jsonl`, `.parquet`) in one of these places.
         output: A directory or `s3://bucket/prefix` that belongs to this job alone.
         preset: Engine preset.
         camera: Camera model.
