@@ -47,7 +47,7 @@ class AgentConfig:
         max_worker_deaths: A video that killed its worker so often is quarantined.
         max_death_places: So is one that killed workers in so many places, GPUs or slots.
         max_video_tries: Attempts within one lease at a video whose error says that another attempt can succeed.
-        max_slot_deaths: Deaths in a row, of more than one video, after which a slot is fenced.
+        max_slot_deaths: Deaths in a row, with no success between, after which a slot is fenced.
         storage_tries: Attempts at one storage operation before the lease is given back.
         max_give_backs: How often this agent gives one shard back. After that an input that still cannot be fetched
             becomes an error row, and a shard that still cannot be packed fails its job.

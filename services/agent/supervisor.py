@@ -6,7 +6,7 @@
               | storage down: back off, then give the lease back
 
 Coordinated caps keep one bad part from taking the rest with it. A video that kills the worker is tried last and is
-quarantined after `max_worker_deaths`, or after fewer in different places. A slot on which distinct videos die in a row
+quarantined after `max_worker_deaths`, or after fewer in different places. A slot on which workers die in a row
 is itself the suspect and is fenced before it can quarantine the innocent. Where a slot has seen nothing but the deaths
 of one video, it cannot tell which of the two is bad: before its last try the shard is given back, so that another slot
 may say.
@@ -209,7 +209,7 @@ class Supervisor:
         while missing := [video for video in lease.videos if video.key not in results]:
             # Those that have killed a worker go last: the others are safe by then, and the slot has proved itself.
             video = min(missing, key=lambda v: len(deaths.get(v.key, ())) + timeouts.get(v.key, 0))
-            if self._is_poison(deaths.get(video.key, ())):
+            if self._is_poison(video.key, deaths.get(video.key, ())):
                 results[video.key] = self._quarantined(video, lease, deaths[video.key])
                 continue
             if self._worn_out():
@@ -387,10 +387,14 @@ class Supervisor:
             return at_least
         return counted if len(counted) >= len(at_least) else at_least
 
-    def _is_poison(self, deaths: tuple[Death, ...]) -> bool:
-        """Dead in two places, it is the video and not the place; dead often enough, nobody asks any more."""
+    def _is_poison(self, key: str, deaths: tuple[Death, ...]) -> bool:
+        """Dead in two places, it is the video and not the place. In one place it takes more deaths, and a slot that
+        was there and has done other work since: one that sees it for the first time tries."""
         places = {death.place for death in deaths if death.place}
-        return len(deaths) >= self._config.max_worker_deaths or len(places) >= self._config.max_death_places
+        if len(places) >= self._config.max_death_places:
+            return True
+        seen_here = not places or self._handle.place in places
+        return len(deaths) >= self._config.max_worker_deaths and seen_here and key not in self._suspicious
 
     def _worn_out(self) -> bool:
         """Whether the worker process has done enough: leaks of drivers and decoders end with it."""
@@ -409,15 +413,11 @@ class Supervisor:
 
     def _suspect(self, key: str) -> None:
         self._suspicious.append(key)
-        distinct = set(self._suspicious)
-        if len(self._suspicious) >= self._config.max_slot_deaths and len(distinct) >= min(
-            2, self._config.max_slot_deaths
-        ):
+        if len(self._suspicious) >= self._config.max_slot_deaths:
             logger.error(
-                "this slot is fenced: the worker died %d times in a row, on %d distinct videos (%s)",
+                "this slot is fenced: the worker died %d times in a row (%s)",
                 len(self._suspicious),
-                len(distinct),
-                ", ".join(sorted(distinct)),
+                ", ".join(sorted(set(self._suspicious))),
             )
             raise _Ended(ShardOutcome("given_back", "slot_fenced", "the worker keeps dying", fenced=True))
 

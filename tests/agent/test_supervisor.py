@@ -97,10 +97,14 @@ def test_where_only_one_video_died_another_slot_is_asked(rig: Rig) -> None:
     outcome = rig.supervisor.work(live)
     assert (outcome.kind, outcome.reason, outcome.fenced) == ("given_back", "worker_died", False)
     assert rig.slot.annotated() == ["lonely", "lonely"]
+    live = rig.lease()
+    assert rig.supervisor.work(live).fenced, "asked again, the slot itself is the suspect"
     rig.slot.where = "elsewhere/slot-0"
+    rig.supervisor.pardon()  # The supervisor of another slot has seen nothing of this.
     live = rig.lease()
     assert rig.supervisor.work(live).kind == "committed"
     assert rig.rows(live)["lonely"].status is VideoStatus.QUARANTINED
+    assert rig.slot.annotated() == ["lonely"] * 4
 
 
 def test_a_bad_slot_is_fenced_before_it_condemns_one_of_two(rig: Rig) -> None:
