@@ -161,6 +161,18 @@ class Settings(BaseSettings):
     video_timeout_per_frame_s: float = Field(default=5.0, ge=0)
     """See `video_timeout_base_s`."""
 
+    webhook_secrets: dict[str, SecretStr] = Field(default_factory=dict)
+    """Secrets that sign webhooks, `{"tenant/name": "secret"}` as JSON; jobs name them. For the API and its agents."""
+
+    webhook_hosts: tuple[str, ...] = ("*",)
+    """Hosts that webhooks may name: `host`, `*.domain` or `*`, each with `:port` or `:*` where it is not 443."""
+
+    webhook_networks: tuple[IPvAnyNetwork, ...] = ()
+    """Networks that are not public and that webhooks may reach, such as `10.1.0.0/16`. As JSON list."""
+
+    webhook_allow_http: bool = False
+    """Send webhooks to `http://` addresses too, where what they say can be read on the way."""
+
     log_level: str = "INFO"
     """Least severe messages that are logged."""
 
@@ -173,10 +185,25 @@ class Settings(BaseSettings):
             raise ValueError("tls_cert_file and tls_key_file go together")
         return self
 
-    @field_validator("http_hosts")
+    def webhook_policy(self) -> NetworkPolicy:
+        """Where webhooks may go."""
+        schemes = ("https", "http") if self.webhook_allow_http else ("https",)
+        return NetworkPolicy(self.webhook_hosts, self.webhook_networks, schemes)
+
+    @field_validator("http_hosts", "webhook_hosts")
     @classmethod
     def _host_patterns(cls, value: tuple[str, ...]) -> tuple[str, ...]:
         return NetworkPolicy(value).hosts
+
+    @field_validator("webhook_secrets")
+    @classmethod
+    def _scoped(cls, value: dict[str, SecretStr]) -> dict[str, SecretStr]:
+        for name, secret in value.items():
+            if not all(name.partition("/")[::2]):
+                raise ValueError(f"{name!r} must be `tenant/name`: a secret belongs to one tenant")
+            if len(secret.get_secret_value()) < 16:
+                raise ValueError(f"the secret {name!r} is shorter than 16 characters")
+        return value
 
     @field_validator("data_dir", "scratch_dir")
     @classmethod

@@ -1,8 +1,9 @@
 """The agent's loop: keep slots busy with leases, keep leases alive, keep jobs moving, and never stop for one of them.
 
 Threads: `agent` owns the executor and claims work; one per slot supervises it; `agent-renew` renews every lease in one
-call; `agent-jobs` plans and finalises, which can take long. The agent holds no truth: killed at any point, its leases
-run out, and whoever takes them finds what is committed in the output and what is finished in the scratch folder.
+call; `agent-jobs` plans and finalises, which can take long; `agent-webhooks` sends what jobs have to tell. The agent
+holds no truth: killed at any point, its leases run out, and whoever takes them finds what is committed in the output
+and what is finished in the scratch folder.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ from services.agent.executor import Executor, SlotHandle
 from services.agent.jobs import JobKeeper
 from services.agent.leases import LeaseBook, LiveLease, StopReason
 from services.agent.supervisor import ShardOutcome, Supervisor
+from services.agent.webhooks import WebhookSender
 from services.domain.errors import StoreUnavailable
 from services.observability.metrics import Metrics
 from services.store.base import Store
@@ -55,6 +57,7 @@ class Agent:
         self._committer = Committer(store, metrics, config.s3_endpoint_url)
         self._give_backs = GiveBacks(config.max_give_backs)
         self._jobs = JobKeeper(store, self._committer, config, metrics)
+        self._webhooks = WebhookSender(store, config.webhook_secrets, config.webhook_policy, metrics)
         self._work: queue.SimpleQueue[LiveLease] = queue.SimpleQueue()
         self._stopping = threading.Event()
         self._drained = threading.Event()
@@ -109,7 +112,10 @@ class Agent:
         ]
         renewals = threading.Thread(target=self._renew, name="agent-renew", daemon=True)
         jobs = threading.Thread(target=self._keep_jobs, name="agent-jobs", daemon=True)
-        for thread in (*slot_threads, renewals, jobs):
+        webhooks = threading.Thread(
+            target=self._webhooks.run, args=(self._stopping, self._config.poll_s), name="agent-webhooks", daemon=True
+        )
+        for thread in (*slot_threads, renewals, jobs, webhooks):
             thread.start()
         logger.info("agent %s: %d slots, device %s", self.holder, len(slots), self._config.device)
         self._claim_until_stopped()
@@ -124,6 +130,7 @@ class Agent:
         self._executor.stop()
         # Planning and finalising can be deep in somebody else's call; both are done over when they are cut off.
         jobs.join(self._config.cancel_grace_s)
+        webhooks.join(self._config.cancel_grace_s)
         logger.info("agent %s has stopped", self.holder)
 
     def _start_executor(self) -> bool:
@@ -181,7 +188,9 @@ class Agent:
                     self._metrics.lease_expired.inc(expired)
                 if now >= next_counts_s:
                     next_counts_s = now + _COUNTS_INTERVAL_S
-                    self._metrics.set_counts(self._store.counts())
+                    if paused := self._store.pause_over_limits():
+                        logger.warning("paused %d jobs at their deadline or budget", paused)
+                    self._publish_store()
                 if now >= self._claim_after_s:
                     self._claim()
             except Exception as error:
@@ -264,9 +273,15 @@ class Agent:
 
     def _renew(self) -> None:
         # Beyond `stopping`: slots that are still giving back must not lose their leases meanwhile.
-        while not self._drained.wait(self._config.lease_ttl_s / 3):
+        period_s = self._config.lease_ttl_s / 3
+        next_renewal_s = time.monotonic() + period_s
+        while not self._drained.wait(min(self._config.poll_s, period_s)):
             try:
-                self._leases.renew()
+                if time.monotonic() >= next_renewal_s:
+                    next_renewal_s = time.monotonic() + period_s
+                    self._leases.renew()
+                else:
+                    self._leases.watch()
             except Exception:
                 logger.exception("renewing the leases failed")
 
@@ -291,6 +306,11 @@ class Agent:
         self._publish_slots()
         if state is SlotState.IDLE:
             self._wake.set()
+
+    def _publish_store(self) -> None:
+        self._metrics.set_counts(self._store.counts())
+        self._metrics.set_tenants(self._store.list_tenants())
+        self._metrics.webhooks_waiting.set(self._store.undelivered())
 
     def _publish_slots(self) -> None:
         with self._lock:

@@ -5,9 +5,12 @@ from __future__ import annotations
 import os
 import socket
 import uuid
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
+
+from pydantic import SecretStr
 
 from services.inputs.rules import InputRules
 from services.network.addresses import NetworkPolicy
@@ -62,6 +65,8 @@ class AgentConfig:
         media: Bounds on one video, see `vipe_core.video.Limits`.
         output_roots: Where local outputs must lie; empty: anywhere.
         s3_endpoint_url: S3 service other than AWS.
+        webhook_secrets: `tenant/name` -> secret that signs the webhooks that name it.
+        webhook_policy: Where webhooks may go.
     """
 
     scratch_dir: Path
@@ -96,6 +101,8 @@ class AgentConfig:
     media: Limits = field(default_factory=Limits)
     output_roots: tuple[Path, ...] = ()
     s3_endpoint_url: str | None = None
+    webhook_secrets: Mapping[str, SecretStr] = field(default_factory=dict)
+    webhook_policy: NetworkPolicy = field(default_factory=NetworkPolicy)
     holder: str = field(default_factory=new_holder)
 
     def __post_init__(self) -> None:
@@ -143,4 +150,6 @@ def config_from_settings(settings: Settings) -> AgentConfig:
         media=settings.media_limits(),
         output_roots=settings.output_roots,
         s3_endpoint_url=settings.s3_endpoint_url,
+        webhook_secrets=settings.webhook_secrets,
+        webhook_policy=settings.webhook_policy(),
     )

@@ -14,6 +14,7 @@ from enum import StrEnum
 
 from services.agent.messages import SlotProgress
 from services.domain.models import Lease, LeaseProgress, VideoResult
+from services.domain.states import JobState
 from services.observability.metrics import Metrics
 from services.store.base import Store
 
@@ -24,6 +25,7 @@ class StopReason(StrEnum):
     """Why work on a lease ends early."""
 
     CANCELLED = "cancelled"  # the user cancelled the job
+    PAUSED = "paused"  # the job was paused: what is finished stays in scratch, for when it is resumed
     LOST = "lost"  # the lease ran out or belongs to somebody else
     DRAINED = "drained"  # this agent is shutting down
 
@@ -53,9 +55,10 @@ class LiveLease:
         self._closed = True
 
     def stop(self, reason: StopReason) -> None:
-        """The first reason stays, except that a lost lease outranks a drain: it must not be given back."""
+        """The first reason stays, except that a lost lease must not be given back and a cancelled one keeps nothing."""
         with self._lock:
-            if self._stop is None or (self._stop is StopReason.DRAINED and reason is StopReason.LOST):
+            for_good = reason in (StopReason.LOST, StopReason.CANCELLED)
+            if self._stop is None or (self._stop in (StopReason.DRAINED, StopReason.PAUSED) and for_good):
                 self._stop = reason
 
     def follow(self, results: tuple[VideoResult, ...], position: Callable[[], SlotProgress]) -> None:
@@ -121,6 +124,17 @@ class LeaseBook:
         with self._lock:
             return list(self._live.values())
 
+    def watch(self) -> None:
+        """Renew ahead of time if a job does not run any more: its leases are to stop within seconds. Never raises."""
+        working = [entry for entry in self.all() if not entry.closed and entry.stop_reason is None]
+        try:
+            states = self._store.job_states({entry.lease.job_id for entry in working})
+        except Exception as error:
+            logger.debug("could not look at the jobs: %s", error)  # The renewals say so, and act on it.
+            return
+        if any(states.get(entry.lease.job_id) is not JobState.RUNNING for entry in working):
+            self.renew()
+
     def renew(self) -> None:
         """Renew every lease in one call and pass on what the store says. Never raises."""
         entries = [entry for entry in self.all() if not entry.closed]
@@ -144,6 +158,9 @@ class LeaseBook:
             match verdicts.get(entry.lease.shard_id, "lost"):
                 case "continue":
                     entry.deadline_s = asked_s + self._ttl_s
+                case "pause":
+                    entry.deadline_s = asked_s + self._ttl_s
+                    entry.stop(StopReason.PAUSED)
                 case "cancel":
                     entry.deadline_s = asked_s + self._ttl_s
                     entry.stop(StopReason.CANCELLED)

@@ -10,7 +10,7 @@ from fastapi import APIRouter, FastAPI, Request, Response
 from fastapi.openapi.utils import get_openapi
 from starlette.middleware.cors import CORSMiddleware
 
-from services.api import access_routes, problems, routes
+from services.api import access_routes, control, problems, routes
 from services.api.audit import AuditTrail
 from services.api.authentication import Authenticator, serves_anonymous
 from services.api.guard import Guard
@@ -83,6 +83,7 @@ def create_app(
         app.add_middleware(KnownHosts, names=settings.allowed_hosts, loopback=open_on_loopback)
     app.add_middleware(RequestContext, metrics=metrics)
     app.include_router(routes.router)
+    app.include_router(control.router)
     app.include_router(access_routes.router)
     app.include_router(_operations)
     _document_problems(app)
@@ -112,8 +113,11 @@ def readyz(request: Request) -> Readiness:
 def metrics(request: Request) -> Response:
     """Prometheus metrics, without the store's counts while it does not answer."""
     page: Metrics = request.app.state.metrics
+    store: Store = request.app.state.store
     try:
-        page.set_counts(request.app.state.store.counts())
+        page.set_counts(store.counts())
+        page.set_tenants(store.list_tenants())
+        page.webhooks_waiting.set(store.undelivered())
     except StoreUnavailable:
         page.store_is_down()
     return Response(page.render(), media_type=CONTENT_TYPE)

@@ -137,8 +137,9 @@ async def _follow(
         for event in events:
             seq = event.seq
             yield _sse(event)
-            if ends_history(event.kind):
-                return
+        # In the middle of the history of a job that was retried, such an event ends nothing.
+        if events and ends_history(events[-1].kind) and len(events) < _BATCH:
+            return
         # The reader knows the job's last event already.
         if job.state.terminal and not events:
             return

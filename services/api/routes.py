@@ -27,6 +27,7 @@ from services.api.schemas import (
     VideoPage,
     VideoView,
 )
+from services.api.webhooks import check_webhook
 from services.domain.errors import InvalidRequest, JobNotFound, StorageRefused
 from services.domain.models import JobSpec
 from services.domain.states import JobState, VideoStatus
@@ -93,10 +94,12 @@ def create_job(
     """Create a job. Sent again within 7 days with the same `Idempotency-Key` and body, it gets its first answer."""
     spec = body.to_spec()
     _check_places(spec, request.app.state.settings)
+    control = body.to_control()
+    check_webhook(control, caller.tenant, request.app.state.settings)
     working: KeysInWork = request.app.state.keys_in_work
     with working.on(caller.tenant, idempotency_key):
         job, created = store.create_job(
-            spec, tenant=caller.tenant, idempotency_key=idempotency_key, request_hash=request_hash
+            spec, control=control, tenant=caller.tenant, idempotency_key=idempotency_key, request_hash=request_hash
         )
     response.headers["Location"] = f"/v1/jobs/{job.id}"
     if not created:

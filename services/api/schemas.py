@@ -8,6 +8,8 @@ from typing import Annotated, Any, Literal, Self
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
 
 from services.api import offer
+from services.api.control_schemas import ControlFields, ControlView
+from services.domain.control import PauseReason
 from services.domain.models import DEFAULT_ATTRIBUTES, Event, Job, JobSpec, Shard
 from services.domain.states import JobState, ShardState, VideoStatus
 from services.store.base import VideoRow
@@ -15,7 +17,7 @@ from services.store.base import VideoRow
 Address = Annotated[str, Field(min_length=1, max_length=2048), AfterValidator(offer.address)]
 
 
-class JobRequest(BaseModel):
+class JobRequest(ControlFields):
     """A job to run."""
 
     model_config = ConfigDict(
@@ -123,6 +125,11 @@ class JobView(_View):
     state: JobState
     spec: SpecView
     planned: bool = Field(description="Whether every shard is known, so that the totals are final.")
+    control: ControlView
+    pause_reason: PauseReason | None = Field(description="Why it is paused; null where it is not.")
+    pause_message: str | None
+    slot_seconds: float = Field(description="Seconds that worker slots spent on it, lost and live leases included.")
+    retries: int = Field(description="How often videos of it that failed were tried again.")
     error_code: str | None
     error_message: str | None
     created_at: datetime

@@ -1,4 +1,4 @@
-"""`vipectl submit | jobs | status | watch | videos | cancel`: the service over REST."""
+"""`vipectl submit | jobs | status | watch | videos | set | pause | resume | cancel | retry`: the service over REST."""
 
 from __future__ import annotations
 
@@ -19,6 +19,28 @@ ApiKey = Annotated[
 ]
 AsJson = Annotated[bool, typer.Option("--json", help="The service's JSON instead of a table.")]
 DEFAULT_API = "http://127.0.0.1:8080"
+
+Deadline = Annotated[
+    str | None, typer.Option(metavar="TIME", help="When it passes, the job is paused: 2030-01-31T12:00:00Z; none.")
+]
+SlotHours = Annotated[
+    str | None, typer.Option(metavar="HOURS", help="Hours of worker slots after which the job is paused; none.")
+]
+WebhookUrl = Annotated[str | None, typer.Option(metavar="URL", help="Who is told about the job's events.")]
+WebhookSecret = Annotated[str | None, typer.Option(metavar="NAME", help="Name of the secret that signs them.")]
+
+
+def _limits(deadline: str | None, max_slot_hours: str | None) -> dict[str, Any]:
+    """The limits that were named; `none` takes one away."""
+    limits: dict[str, Any] = {}
+    if deadline is not None:
+        limits["deadline"] = None if deadline == "none" else deadline
+    if max_slot_hours is not None:
+        try:
+            limits["max_slot_hours"] = None if max_slot_hours == "none" else float(max_slot_hours)
+        except ValueError:
+            raise typer.BadParameter(f"--max-slot-hours takes a number or none, not {max_slot_hours!r}") from None
+    return limits
 
 
 def _client(api: str, api_key: str | None) -> Client:
@@ -47,6 +69,11 @@ def submit(
         str | None,
         typer.Option(metavar="A,B,...", help="Tars to write: depth,rgb,mask,confidence; the last only if named."),
     ] = None,
+    priority: Annotated[int, typer.Option(help="The highest of your jobs goes first.")] = 0,
+    deadline: Deadline = None,
+    max_slot_hours: SlotHours = None,
+    webhook: WebhookUrl = None,
+    webhook_secret: WebhookSecret = None,
     key: Annotated[
         str | None, typer.Option("--idempotency-key", help="The same key and job is never run twice.")
     ] = None,
@@ -63,7 +90,11 @@ def submit(
         "preset": preset,
         "camera": camera,
         "name": name,
+        "priority": priority,
+        **_limits(deadline, max_slot_hours),
     }
+    if webhook is not None:
+        spec["webhook"] = {"url": webhook, "secret": webhook_secret or ""}
     if scale_from is not None:
         spec["scale_from"] = scale_from
     if attributes is not None:
@@ -142,3 +173,55 @@ def videos(
 def cancel(job_id: str, api: ApiUrl = DEFAULT_API, api_key: ApiKey = None) -> None:
     """Cancel a job; what is committed stays."""
     typer.echo(_client(api, api_key).cancel(job_id)["state"])
+
+
+def pause(job_id: str, api: ApiUrl = DEFAULT_API, api_key: ApiKey = None) -> None:
+    """Pause a job: no new work begins, what is finished stays."""
+    typer.echo(_client(api, api_key).pause(job_id)["state"])
+
+
+def resume(job_id: str, api: ApiUrl = DEFAULT_API, api_key: ApiKey = None) -> None:
+    """Resume a paused job."""
+    typer.echo(_client(api, api_key).resume(job_id)["state"])
+
+
+def change(
+    job_id: str,
+    priority: Annotated[int | None, typer.Option(help="The highest of your jobs goes first.")] = None,
+    deadline: Deadline = None,
+    max_slot_hours: SlotHours = None,
+    max_failure_ratio: Annotated[
+        float | None, typer.Option(help="Pause when more of the last videos failed; 0.5 is half of them.")
+    ] = None,
+    webhook: WebhookUrl = None,
+    webhook_secret: WebhookSecret = None,
+    api: ApiUrl = DEFAULT_API,
+    api_key: ApiKey = None,
+) -> None:
+    """Change how a job is run: its priority, limits, webhook."""
+    changes = _limits(deadline, max_slot_hours)
+    if priority is not None:
+        changes["priority"] = priority
+    if max_failure_ratio is not None:
+        changes["max_failure_ratio"] = max_failure_ratio
+    if webhook is not None:
+        changes["webhook"] = None if webhook == "none" else {"url": webhook, "secret": webhook_secret or ""}
+    _print_json(_client(api, api_key).change(job_id, **changes)["control"])
+
+
+def retry(
+    job_id: str,
+    error_code: Annotated[
+        list[str] | None, typer.Option("--error-code", metavar="CODE", help="Videos that failed with it; repeatable.")
+    ] = None,
+    quarantined: Annotated[bool, typer.Option("--quarantined", help="Videos that killed their workers.")] = False,
+    wait: Annotated[bool, typer.Option("--wait", help="Show progress until the job ends.")] = False,
+    api: ApiUrl = DEFAULT_API,
+    api_key: ApiKey = None,
+) -> None:
+    """Try videos of a job again that failed; by default those that another attempt can cure."""
+    client = _client(api, api_key)
+    job = client.retry(job_id, error_codes=error_code or (), select="quarantined" if quarantined else None)
+    typer.echo(job["state"])
+    if wait:
+        _watch(client, job_id)

@@ -9,7 +9,7 @@ from typing import Annotated, ParamSpec, TypeVar
 
 import typer
 
-from services.cli import annotate, data, demo, evaluate, export, gallery, jobs, keys, serve
+from services.cli import annotate, data, demo, evaluate, export, gallery, jobs, keys, serve, tenants
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -73,7 +73,13 @@ _COMMANDS: dict[str, Callable[..., None]] = {
     "status": jobs.status,
     "watch": jobs.watch,
     "videos": jobs.videos,
+    "set": jobs.change,
+    "pause": jobs.pause,
+    "resume": jobs.resume,
     "cancel": jobs.cancel,
+    "retry": jobs.retry,
+    "tenants": tenants.tenants,
+    "limit": tenants.limit,
     "verify": data.verify,
     "unpack": data.unpack,
     "export": export.export,

@@ -19,7 +19,8 @@ def describe(job: dict[str, Any]) -> str:
     """One line: state, videos, frames, rate and remaining time."""
     progress = job["progress"]
     settled = progress["videos_succeeded"] + progress["videos_failed"] + progress["videos_quarantined"]
-    parts = [job["state"], f"videos {settled}/{progress['videos_total']}"]
+    state = job["state"] if job["pause_reason"] is None else f"paused ({job['pause_reason']})"
+    parts = [state, f"videos {settled}/{progress['videos_total']}"]
     expected = progress["frames_expected"]
     parts.append(f"frames {progress['frames_done']}" + (f"/{expected}" if expected else ""))
     if progress["frames_per_s"]:

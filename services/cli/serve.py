@@ -63,7 +63,7 @@ def up(
     )
     if "lease_ttl_s" not in settings.model_fields_set:
         settings = settings.model_copy(update={"lease_ttl_s": _EMBEDDED_LEASE_TTL_S})
-    with _open_store(settings) as store:
+    with open_store(settings) as store:
         check_exposure(settings, store)  # before Ray and the workers start
         metrics = _metrics()
         with _running_agent(store, settings, metrics) as running:
@@ -81,7 +81,7 @@ def api(
     settings = settings_from(
         host=host, port=port, database_url=database_url, tls_cert_file=tls_cert, tls_key_file=tls_key
     )
-    with _open_store(settings) as store:
+    with open_store(settings) as store:
         _serve_api(store, settings, _metrics())
 
 
@@ -101,7 +101,7 @@ def agent(
     stop = threading.Event()
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: stop.set())
-    with _open_store(settings) as store, _running_agent(store, settings, metrics):
+    with open_store(settings) as store, _running_agent(store, settings, metrics):
         server, _ = metrics.serve(metrics_port, metrics_host)
         logger.info("metrics on http://%s:%d/metrics", metrics_host, server.server_port)
         stop.wait()
@@ -114,7 +114,7 @@ def _metrics() -> Metrics:
 
 
 @contextlib.contextmanager
-def _open_store(settings: Settings) -> Iterator[SqlStore]:
+def open_store(settings: Settings) -> Iterator[SqlStore]:
     from services.store.sql import open_when_ready
 
     settings.data_dir.mkdir(parents=True, exist_ok=True)

@@ -5,9 +5,10 @@ from __future__ import annotations
 import itertools
 import time
 import uuid
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from datetime import datetime
 from types import TracebackType
-from typing import Any
+from typing import Any, Literal
 
 import httpx
 
@@ -123,6 +124,41 @@ class Client:
                     return job
             raise
 
+    def pause(self, job_id: str) -> Json:
+        """Pause a job: no new work begins, what is under way is given back within seconds."""
+        return self._call("POST", f"/v1/jobs/{job_id}/pause")
+
+    def resume(self, job_id: str) -> Json:
+        """Resume a paused job; a limit that paused it must be changed first."""
+        return self._call("POST", f"/v1/jobs/{job_id}/resume")
+
+    def change(self, job_id: str, **changes: Any) -> Json:
+        """Change how a job is run: `priority`, `deadline` (aware, or RFC 3339), `max_slot_hours`, `max_failure_ratio`,
+        `failure_window`, `webhook` (`{"url", "secret"}` or None)."""
+        body = {name: value.isoformat() if isinstance(value, datetime) else value for name, value in changes.items()}
+        return self._call("PATCH", f"/v1/jobs/{job_id}", json=body)
+
+    def retry(
+        self,
+        job_id: str,
+        *,
+        error_codes: Sequence[str] = (),
+        select: Literal["retryable", "quarantined"] | None = None,
+    ) -> Json:
+        """Try videos again, in new shards of a job that succeeded with errors.
+
+        Not repeated when the answer is lost: look at the job's `retries` then.
+
+        Args:
+            job_id: Which.
+            error_codes: Videos that failed with one of these; none: as `select` says.
+            select: `retryable` (default): what another attempt can cure. `quarantined`: what killed its workers.
+        """
+        body: Json = {"error_codes": list(error_codes)} if error_codes else {}
+        if select is not None:
+            body["select"] = select
+        return self._call("POST", f"/v1/jobs/{job_id}/retry", json=body)
+
     def events(self, job_id: str, *, after_seq: int = 0) -> Iterator[Json]:
         """A job's history and what happens next, until it has ended.
 
@@ -136,7 +172,7 @@ class Client:
         heard_at = time.monotonic()
         ended = False
         while True:
-            received = False
+            received, last = False, ""
             try:
                 headers = {"Accept": "text/event-stream", "Last-Event-ID": str(seq)}
                 with self._http.stream("GET", f"/v1/jobs/{job_id}/events", headers=headers) as response:
@@ -151,14 +187,14 @@ class Client:
                             yield {"kind": "progress", "data": event.json()}
                             continue
                         seq = int(event.id or seq)
-                        received = True
+                        received, last = True, event.name
                         yield event.json()
-                        if ends_history(event.name):
-                            return
-                # It ended early because the service stops, or because the job's last event was known already.
-                if ended and not received:
+                # It ended because the job has, or early because the service stops; a job that was retried goes on
+                # behind an event that once was its last.
+                terminal = JobState(self.job(job_id)["state"]).terminal
+                if terminal and (ends_history(last) or (ended and not received)):
                     return
-                ended = JobState(self.job(job_id)["state"]).terminal
+                ended = terminal
             except (httpx.TransportError, ApiError) as error:
                 if isinstance(error, ApiError) and error.code != _UNREACHABLE:
                     raise

@@ -158,6 +158,7 @@ def prepare_payload(
         tar_name=tar_name,
         objects=tuple(objects),
         videos=videos,
+        retry=lease.retry,
     )
     return PreparedPayload(record, build_s, upload_s)
 

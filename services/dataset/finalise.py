@@ -38,17 +38,24 @@ from services.domain.states import VideoStatus
 from services.storage.base import ObjectStore
 
 _ROW_GROUP = 10_000
+_ALL_FAILURES = "failures-of-all-records.parquet"
 
 
 @dataclass(slots=True)
 class Totals:
-    """What a data set holds."""
+    """What a data set holds.
+
+    Attributes:
+        superseded: Rows of failures in the records that rows of a later retry took the place of: the records together
+            have `videos + superseded` rows.
+    """
 
     shards: int = 0
     videos: int = 0
     succeeded: int = 0
     failed: int = 0
     quarantined: int = 0
+    superseded: int = 0
     frames: int = 0
     objects: int = 0
     size_bytes: int = 0
@@ -59,13 +66,20 @@ class Totals:
 class Completeness:
     """Checks a stream of records: every shard once, every video once, every object present with its size.
 
+    A video may occur again in the record of a later retry, if it had failed before; then only its last row counts.
+
     Memory: some hundred bytes per object and per video.
+
+    Attributes:
+        replaced: (video key, shard id) of rows that do not count any more.
     """
 
     sizes: dict[str, int]
     totals: Totals = field(default_factory=Totals)
     _ordinals: set[int] = field(default_factory=set)
+    replaced: set[tuple[str, str]] = field(default_factory=set)
     _videos: set[bytes] = field(default_factory=set)
+    _lost: dict[bytes, tuple[VideoStatus, str, int]] = field(default_factory=dict)
 
     @classmethod
     def of(cls, store: ObjectStore) -> Completeness:
@@ -90,8 +104,10 @@ class Completeness:
         for video in record.videos:
             digest = hashlib.blake2b(video.key.encode(), digest_size=16).digest()
             if digest in self._videos:
-                raise IntegrityError(f"video {video.key} occurs twice, the second time in shard {record.shard_id}")
+                self._replace(digest, video.key, record)
             self._videos.add(digest)
+            if video.status in (VideoStatus.FAILED, VideoStatus.QUARANTINED):
+                self._lost[digest] = (video.status, record.shard_id, record.retry)
             totals.videos += 1
             if video.status is VideoStatus.SUCCEEDED:
                 totals.succeeded += 1
@@ -108,6 +124,20 @@ class Completeness:
     def ordinals(self) -> frozenset[int]:
         """Numbers of the shards that have a record."""
         return frozenset(self._ordinals)
+
+    def _replace(self, digest: bytes, key: str, record: CommitRecord) -> None:
+        """Take back the row of a failure that is followed by one of a later retry."""
+        status, shard, retry = self._lost.pop(digest, (VideoStatus.SUCCEEDED, "", 0))
+        if status is VideoStatus.SUCCEEDED or record.retry <= retry:
+            raise IntegrityError(f"video {key} occurs twice, the second time in shard {record.shard_id}")
+        self.replaced.add((key, shard))
+        totals = self.totals
+        totals.superseded += 1
+        totals.videos -= 1
+        if status is VideoStatus.QUARANTINED:
+            totals.quarantined -= 1
+        else:
+            totals.failed -= 1
 
     def close(self, num_shards: int | None, num_videos: int | None) -> Totals:
         """The totals, if they are what was planned; raises IntegrityError if not."""
@@ -147,7 +177,7 @@ def finalise(
         completeness = Completeness.of(store)
         with (
             _RowWriter(folder / META_KEY, meta_schema(spec)) as meta,
-            _RowWriter(folder / FAILURES_KEY, FAILURES_SCHEMA) as failures,
+            _RowWriter(folder / _ALL_FAILURES, FAILURES_SCHEMA) as failures,
             (folder / "shards").open("w", encoding="utf-8") as shards,
         ):
             for record, digest in stored_records(store, job_id):
@@ -160,6 +190,7 @@ def finalise(
                         failures.write(failure_row(record, video))
                 shards.write(("" if completeness.totals.shards == 1 else ",\n") + json.dumps(_shard(record, digest)))
         totals = completeness.close(num_shards, num_videos)
+        _leave_out(folder / _ALL_FAILURES, folder / FAILURES_KEY, completeness.replaced)
         description = {
             "schema_version": SCHEMA_VERSION,
             "job_id": job_id,
@@ -200,6 +231,15 @@ class _RowWriter:
         if self._rows:
             self._writer.write_table(pa.Table.from_pylist(self._rows, schema=self._schema))
             self._rows.clear()
+
+
+def _leave_out(source: Path, target: Path, replaced: set[tuple[str, str]]) -> None:
+    """Copy the rows of failures that still count."""
+    with _RowWriter(target, FAILURES_SCHEMA) as kept:
+        for batch in pq.ParquetFile(source).iter_batches(batch_size=_ROW_GROUP):
+            for row in batch.to_pylist():
+                if (row["sequence"], row["shard_id"]) not in replaced:
+                    kept.write(row)
 
 
 def _shard(record: CommitRecord, digest: str) -> dict[str, Any]:

@@ -152,10 +152,10 @@ def verify(
 
 @dataclass(slots=True)
 class _Plan:
-    """What there must be; some hundred bytes a shard."""
+    """What there must be; some hundred bytes a shard, and as many a video: a retry plans some of them again."""
 
     head: PlanHead
-    num_videos: int = 0
+    _videos: set[bytes] = field(default_factory=set)
     _shards: dict[int, tuple[str, bytes]] = field(default_factory=dict)
 
     @classmethod
@@ -164,13 +164,17 @@ class _Plan:
 
         def add(shard: PlannedShard) -> None:
             plan._shards[shard.ordinal] = (shard.plan_hash, _digest(shard.videos))
-            plan.num_videos += len(shard.videos)
+            plan._videos.update(hashlib.blake2b(key.encode(), digest_size=16).digest() for key in shard.videos)
 
         try:
             plan.head = read_plan(store, job_id, add)
         except IntegrityError as error:
             report.problem(str(error))
         return plan
+
+    @property
+    def num_videos(self) -> int:
+        return len(self._videos)
 
     def check(self, record: CommitRecord, report: Report) -> None:
         """A record must be that of a planned shard, with its videos in their order."""
@@ -198,6 +202,7 @@ class _Index:
         self._meta = _Listed(META_KEY, (tuple(r.values()) for r in self._index.rows(_META_COLUMNS)), report)
         self._failures = _Listed(FAILURES_KEY, _failures(store), report)
         self._shards = _Listed(DATASET_KEY, _described_shards(described), report)
+        self._lost: list[tuple[str, tuple[Any, ...]]] = []  # until it is known which of them a retry replaced
         self._records = hashlib.sha256()
         self._knows_records = "records_sha256" in described  # not in what earlier releases wrote
 
@@ -224,7 +229,7 @@ class _Index:
             if video.status is VideoStatus.SUCCEEDED:
                 self._meta.expect((video.key, video.num_frames, record.tar_name))
             else:
-                self._failures.expect((video.key, str(video.status), video.error_code))
+                self._lost.append((record.shard_id, (video.key, str(video.status), video.error_code)))
         objects = ((o.key, o.size_bytes, o.sha256) for o in record.objects)
         self._records.update(digest.encode())
         self._shards.expect((record.shard_id, digest if self._knows_records else None, *objects))
@@ -232,6 +237,9 @@ class _Index:
     def end(self, completeness: Completeness) -> None:
         report, expected = self._report, self._described.get("totals", {})
         try:
+            for shard, row in self._lost:
+                if (row[0], shard) not in completeness.replaced:
+                    self._failures.expect(row)
             for listed in (self._meta, self._failures, self._shards):
                 listed.end()
         except IntegrityError as error:
@@ -242,7 +250,7 @@ class _Index:
         except IntegrityError as error:
             report.problem(str(error))
             report.totals = completeness.totals
-        if asdict(report.totals) != expected:
+        if asdict(report.totals) != {"superseded": 0, **expected}:  # earlier releases knew no retries
             report.problem(f"{DATASET_KEY} states other totals than the commit records")
         if self._described.get("records_sha256") not in (None, self._records.hexdigest()):
             report.problem(f"the commit records are not those that {DATASET_KEY} was made from")

@@ -46,6 +46,47 @@ class JobNotCancellable(ServiceError):
     status = 409
 
 
+class JobNotPausable(ServiceError):
+    code = "job_not_pausable"
+    status = 409
+
+
+class JobNotResumable(ServiceError):
+    """The job is not paused, or the limit that paused it is still exceeded."""
+
+    code = "job_not_resumable"
+    status = 409
+
+
+class JobNotRetryable(ServiceError):
+    """The job has not ended, or ended without an output to add to."""
+
+    code = "job_not_retryable"
+    status = 409
+
+
+class NothingToRetry(ServiceError):
+    """No video of the job failed in the way that was asked for."""
+
+    code = "nothing_to_retry"
+    status = 409
+
+
+class JobEnded(ServiceError):
+    """The job has ended: nothing about how it runs can be changed any more."""
+
+    code = "job_ended"
+    status = 409
+
+
+class QuotaExceeded(ServiceError):
+    """The tenant has as much in its queue as it may have."""
+
+    code = "quota_exceeded"
+    status = 429
+    retryable = True
+
+
 class InvalidTransition(ServiceError):
     """The job is in a state from which this step does not exist."""
 

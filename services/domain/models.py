@@ -9,6 +9,7 @@ from dataclasses import asdict, dataclass, field
 from datetime import datetime
 from typing import Any, Literal
 
+from services.domain.control import JobControl
 from services.domain.states import JobState, ShardState, VideoStatus
 
 Attribute = Literal["pose", "intrinsics", "depth", "rgb", "mask", "confidence"]
@@ -158,6 +159,14 @@ class JobProgress:
 
 @dataclass(frozen=True, slots=True)
 class Job:
+    """A job as it stands.
+
+    Attributes:
+        pause_reason, pause_message: Why it is paused, None otherwise.
+        slot_seconds: Seconds that worker slots spent on it, those of lost and of live leases included.
+        retries: How often its failed videos were tried again.
+    """
+
     id: str
     spec: JobSpec
     state: JobState
@@ -169,6 +178,11 @@ class Job:
     planned: bool = False
     started_at: datetime | None = None
     finished_at: datetime | None = None
+    control: JobControl = field(default_factory=JobControl)
+    pause_reason: str | None = None
+    pause_message: str | None = None
+    slot_seconds: float = 0.0
+    retries: int = 0
     progress: JobProgress = field(default_factory=JobProgress)
 
 
@@ -203,6 +217,7 @@ class Lease:
         attempt: 1 for the first lease.
         spent: Video key -> the worker deaths already blamed on it.
         create_once: Whether the output decides between two writers of a record; otherwise the database does.
+        retry: See `CommitRecord`.
     """
 
     job_id: str
@@ -217,6 +232,7 @@ class Lease:
     expires_at: datetime
     spent: dict[str, tuple[Death, ...]] = field(default_factory=dict)
     create_once: bool = True
+    retry: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -237,7 +253,7 @@ class Renewal:
     """The store's answer to a renewal: go on, or stop and why."""
 
     shard_id: str
-    verdict: Literal["continue", "lost", "cancel"]
+    verdict: Literal["continue", "lost", "cancel", "pause"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -312,7 +328,12 @@ class PayloadObject:
 
 @dataclass(frozen=True, slots=True)
 class CommitRecord:
-    """The one create-once object that makes a shard exist. Readers trust nothing else."""
+    """The one create-once object that makes a shard exist. Readers trust nothing else.
+
+    Attributes:
+        retry: Which retry of the job made this shard, 0 for its first plan. A row of a later retry takes the place of
+            an earlier row of the same video that failed; nothing ever takes the place of one that succeeded.
+    """
 
     job_id: str
     shard_id: str
@@ -325,6 +346,7 @@ class CommitRecord:
     tar_name: str | None
     objects: tuple[PayloadObject, ...]
     videos: tuple[VideoResult, ...]
+    retry: int = 0
     schema_version: int = 1
 
     @property

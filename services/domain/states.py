@@ -8,6 +8,7 @@ from enum import StrEnum
 class JobState(StrEnum):
     QUEUED = "queued"  # accepted, not planned yet
     RUNNING = "running"  # shards exist or are being added
+    PAUSED = "paused"  # no new leases; leased shards are given back, and nothing is planned until it is resumed
     FINALIZING = "finalizing"  # every shard is settled; the index is being written
     CANCELLING = "cancelling"  # no new leases; leased shards are being stopped
     SUCCEEDED = "succeeded"
@@ -23,12 +24,14 @@ class JobState(StrEnum):
 _TERMINAL = {JobState.SUCCEEDED, JobState.SUCCEEDED_WITH_ERRORS, JobState.FAILED, JobState.CANCELLED}
 
 JOB_TRANSITIONS: dict[JobState, frozenset[JobState]] = {
-    JobState.QUEUED: frozenset({JobState.RUNNING, JobState.FAILED, JobState.CANCELLING}),
-    JobState.RUNNING: frozenset({JobState.FINALIZING, JobState.FAILED, JobState.CANCELLING}),
+    JobState.QUEUED: frozenset({JobState.RUNNING, JobState.PAUSED, JobState.FAILED, JobState.CANCELLING}),
+    JobState.RUNNING: frozenset({JobState.FINALIZING, JobState.PAUSED, JobState.FAILED, JobState.CANCELLING}),
+    # Resumed: to where it was.
+    JobState.PAUSED: frozenset({JobState.QUEUED, JobState.RUNNING, JobState.FAILED, JobState.CANCELLING}),
     JobState.FINALIZING: frozenset({JobState.SUCCEEDED, JobState.SUCCEEDED_WITH_ERRORS, JobState.FAILED}),
     JobState.CANCELLING: frozenset({JobState.CANCELLED}),
     JobState.SUCCEEDED: frozenset(),
-    JobState.SUCCEEDED_WITH_ERRORS: frozenset(),
+    JobState.SUCCEEDED_WITH_ERRORS: frozenset({JobState.RUNNING}),  # retried: its failed videos have new shards
     JobState.FAILED: frozenset(),
     JobState.CANCELLED: frozenset(),
 }

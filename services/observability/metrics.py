@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 import platform
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from importlib.metadata import PackageNotFoundError, version
 from typing import TYPE_CHECKING
 
@@ -24,6 +24,7 @@ from prometheus_client import (
     start_http_server,
 )
 
+from services.domain.control import PauseReason, Tenant
 from services.domain.errors import InputUnavailable
 from services.domain.models import VideoResult
 from services.domain.states import JobState, ShardState, VideoStatus
@@ -77,6 +78,29 @@ class Metrics:
             registry=registry,
         )
         self.store_up.set(math.nan)
+
+        self.paused_jobs = Gauge(
+            "vipe_paused_jobs",
+            "Paused jobs by reason: requested, deadline, slot_hours, failure_ratio, tenant_videos.",
+            ["reason"],
+            registry=registry,
+        )
+        self.tenant_slots = Gauge("vipe_tenant_slots", "Live leases by tenant.", ["tenant"], registry=registry)
+        self.tenant_open_videos = Gauge(
+            "vipe_tenant_open_videos",
+            "Videos that are not settled, of jobs that have not ended, by tenant.",
+            ["tenant"],
+            registry=registry,
+        )
+        self.tenant_slot_seconds = Gauge(
+            "vipe_tenant_slot_seconds",
+            "Seconds of worker slots that a tenant's jobs have used since ever, lost and live leases included.",
+            ["tenant"],
+            registry=registry,
+        )
+        self.webhooks_waiting = Gauge(
+            "vipe_webhooks_waiting", "Events that their webhook has not taken yet.", registry=registry
+        )
 
         # Work done by this process.
         self.videos = Counter(
@@ -146,6 +170,14 @@ class Metrics:
             registry=registry,
         )
 
+        # Webhooks.
+        self.webhook_deliveries = Counter(
+            "vipe_webhook_deliveries_total",
+            "Attempts to send an event to a webhook: delivered, failed (and sent again), abandoned.",
+            ["result"],
+            registry=registry,
+        )
+
         # API.
         self.api_request_duration = Histogram(
             "vipe_api_request_duration_seconds",
@@ -169,6 +201,8 @@ class Metrics:
             self.videos.labels(outcome=VideoStatus.FAILED.value, error_class=code)
         for reason in ("died", "video_timeout", "start_failed", "recycled"):
             self.actor_restarts.labels(reason=reason)
+        for result in ("delivered", "failed", "abandoned"):
+            self.webhook_deliveries.labels(result=result)
         for result in ("adopted", "lost_lease", "conflict"):
             self.commit_conflicts.labels(result=result)
 
@@ -180,11 +214,25 @@ class Metrics:
         for shard_state in ShardState:
             self.shards.labels(state=shard_state.value).set(counts.get("shards", {}).get(shard_state.value, 0))
 
+        for reason in PauseReason:
+            self.paused_jobs.labels(reason=reason.value).set(counts.get("paused", {}).get(reason.value, 0))
+
+    def set_tenants(self, tenants: Iterable[Tenant]) -> None:
+        """Publish `Store.list_tenants()`."""
+        for gauge in (self.tenant_slots, self.tenant_open_videos, self.tenant_slot_seconds):
+            gauge.clear()
+        for tenant in tenants:
+            self.tenant_slots.labels(tenant=tenant.name).set(tenant.slots)
+            self.tenant_open_videos.labels(tenant=tenant.name).set(tenant.open_videos)
+            self.tenant_slot_seconds.labels(tenant=tenant.name).set(tenant.slot_seconds)
+
     def store_is_down(self) -> None:
         """Publish that the store does not answer: its counts are unknown, not what they were."""
         self.store_up.set(0)
-        self.jobs.clear()
-        self.shards.clear()
+        for gauge in (self.jobs, self.shards, self.paused_jobs):
+            gauge.clear()
+        self.set_tenants(())
+        self.webhooks_waiting.set(math.nan)
 
     def observe_video(self, result: VideoResult) -> None:
         """Count one video of a shard that this process committed."""

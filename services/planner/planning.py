@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import TypeVar
 
 from services.domain.errors import (
+    JobNotFound,
     ObjectMissing,
     OutputInUse,
     ServiceError,
@@ -26,6 +27,7 @@ from services.domain.errors import (
     code_and_message,
 )
 from services.domain.models import Job, PlannedShard, ShardPlan
+from services.domain.states import JobState
 from services.inputs.rules import InputRules, check_bucket
 from services.planner.listing import Found, expand
 from services.planner.packing import SeenVideos, new_videos, pack
@@ -220,6 +222,7 @@ def check_output_place(output: str, roots: Sequence[Path], buckets: tuple[str, .
 def _take_output(turn: Turn, output: ObjectStore) -> bool:
     """Make the output this job's, and settle who decides its commits. False if the turn is lost."""
     known = turn.store.commit_point(turn.job_id)
+    _remove_abandoned_claim(turn, output)
     check_output_is_free(output, turn.job_id)
     create_once = supports_create_once(output) if known is None else known
     settled = turn.store.settle_commit_point(turn.job_id, turn.fence, create_once)
@@ -231,24 +234,53 @@ def _take_output(turn: Turn, output: ObjectStore) -> bool:
             output.uri,
             turn.job_id,
         )
-    claim_output(output, turn.job_id, create_once=settled)
+    try:
+        claim_output(output, turn.job_id, create_once=settled)
+    except OutputInUse:
+        # The planner of a job that was cancelled a moment ago may have written its claim only now.
+        if not _remove_abandoned_claim(turn, output):
+            raise
+        claim_output(output, turn.job_id, create_once=settled)
     return True
+
+
+def _remove_abandoned_claim(turn: Turn, output: ObjectStore) -> bool:
+    """Remove the claim of a job that ended between its claim and its first shard; whether there was one.
+
+    The database has given such a job's output to this one; nothing else of it can be there, and nothing can come.
+    """
+    owner = _owner(output)
+    if owner is None or owner == turn.job_id:
+        return False
+    try:
+        job = turn.store.get_job(owner)
+    except JobNotFound:
+        return False  # of another database
+    if job.state not in (JobState.FAILED, JobState.CANCELLED) or job.progress.shards_total > 0:
+        return False
+    _log.info("%s was claimed by %s, which ended before it had shards", output.uri, owner)
+    output.delete(CLAIM_KEY)
+    return True
+
+
+def _owner(output: ObjectStore) -> str | None:
+    """The job whose claim lies in the output; empty if it is something else, None if there is none."""
+    try:
+        document = json.loads(output.get_bytes(CLAIM_KEY))
+        return str(document["job_id"])
+    except ObjectMissing:
+        return None
+    except (ValueError, KeyError, TypeError):
+        return ""
 
 
 def check_output_is_free(output: ObjectStore, job_id: str) -> None:
     """Raises OutputInUse if another job's name is in the output; or no job's, but files that a job would replace."""
-    try:
-        document = output.get_bytes(CLAIM_KEY)
-    except ObjectMissing:
+    owner = _owner(output)
+    if owner is None:
         if (taken := _taken_key(output)) is not None:
-            raise OutputInUse(
-                f"output {output.uri} holds {taken} already, which is not ours; choose another folder"
-            ) from None
+            raise OutputInUse(f"output {output.uri} holds {taken} already, which is not ours; choose another folder")
         return
-    try:
-        owner = json.loads(document)["job_id"]
-    except (ValueError, KeyError, TypeError):
-        owner = None
     if owner != job_id:
         name = f"job {owner}" if owner else "something else"
         raise OutputInUse(f"output {output.uri} belongs to {name} ({CLAIM_KEY}); choose another output")

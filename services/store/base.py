@@ -9,11 +9,12 @@ Methods that callers of the API reach take `tenant`: given, the jobs of other te
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
 from services.domain.access import ALL_SCOPES, DEFAULT_TENANT, ApiKey, AuditEntry, AuditEvent, Scope
+from services.domain.control import DEFAULT_CONTROL, Changes, Delivery, JobControl, RetrySelection, Tenant, TenantLimits
 from services.domain.models import (
     CommitRecord,
     Death,
@@ -64,6 +65,7 @@ class Store(Protocol):
         self,
         spec: JobSpec,
         *,
+        control: JobControl = DEFAULT_CONTROL,
         tenant: str = DEFAULT_TENANT,
         idempotency_key: str | None = None,
         request_hash: str | None = None,
@@ -72,13 +74,16 @@ class Store(Protocol):
 
         Args:
             spec: What to do.
+            control: How to run it.
             tenant: Whose job it is.
             idempotency_key: Kept in the transaction that creates the job.
-            request_hash: What the key stands for; default: the spec.
+            request_hash: What the key stands for; default: spec and control.
 
         Raises:
             IdempotencyConflict: The key was used with another request.
             IdempotencyInFlight: A request with this key is being worked on.
+            InvalidRequest: The deadline has passed.
+            QuotaExceeded: The tenant has as many open jobs or videos as it may have.
             OutputInUse: An earlier job has the same output. An output stays with its first job for ever; only a job
                 that failed or was cancelled before it had shards frees it.
         """
@@ -98,6 +103,63 @@ class Store(Protocol):
 
     def request_cancel(self, job_id: str, *, tenant: str | None = None) -> Job:
         """Move to cancelling (a job without live leases is cancelled at once). Raises JobNotCancellable when ended."""
+
+    # Control --------------------------------------------------------------------------------------------------------
+    def change_job(self, job_id: str, changes: Changes, *, tenant: str | None = None) -> Job:
+        """Give fields of the job's control new values. Nothing happens where they are what they were.
+
+        Raises:
+            JobEnded: It is too late.
+            InvalidRequest: The new deadline has passed.
+        """
+
+    def request_pause(self, job_id: str, *, tenant: str | None = None) -> Job:
+        """Queued or running -> paused: no lease of it is given out, and renewals ask for those that live.
+
+        A job that is paused stays as it is. Raises JobNotPausable when it is too late.
+        """
+
+    def resume(self, job_id: str, *, tenant: str | None = None) -> Job:
+        """Paused -> where it was. A job that waits or runs stays as it is.
+
+        Raises:
+            JobNotResumable: It is not paused, or the limit that paused it is still exceeded.
+        """
+
+    def retry(self, job_id: str, selection: RetrySelection, *, tenant: str | None = None) -> Job:
+        """Succeeded with errors -> running, with new shards for the chosen videos; see `services.store.retries`.
+
+        Raises:
+            JobNotRetryable: It has not ended, or not in this state.
+            NothingToRetry: No video is chosen.
+            QuotaExceeded: The tenant has as many open jobs or videos as it may have.
+        """
+
+    def pause_over_limits(self) -> int:
+        """Pause jobs that passed their deadline or used up their slot-hours; returns how many."""
+
+    def job_states(self, job_ids: Collection[str]) -> dict[str, JobState]:
+        """The states of some jobs, cheap enough to ask for every second."""
+
+    # Tenants --------------------------------------------------------------------------------------------------------
+    def list_tenants(self) -> list[Tenant]:
+        """Every tenant that ever had a job or got limits, with what it uses; `*` among them if it has limits."""
+
+    def set_tenant_limits(self, name: str, limits: TenantLimits | None) -> None:
+        """Give a tenant limits of its own, or with None those of `*` again. `*` itself is a name here."""
+
+    # Webhooks -------------------------------------------------------------------------------------------------------
+    def take_deliveries(self, *, limit: int, ttl_s: float) -> list[Delivery]:
+        """Events that are due to be sent, in their order. Nobody else gets them before `ttl_s` is over."""
+
+    def settle_delivery(self, delivery: Delivery, *, error: str | None, retry_in_s: float | None) -> None:
+        """Say how sending went. Without an error it is done; without a time to try again it is given up.
+
+        Nothing happens if somebody else has taken it meanwhile.
+        """
+
+    def undelivered(self) -> int:
+        """How many events wait to be sent."""
 
     # Planning -------------------------------------------------------------------------------------------------------
     # One planner at a time plans a job. Its fence grows with every `begin_planning`; what comes with a smaller one is
@@ -149,8 +211,7 @@ class Store(Protocol):
     def claim(self, holder: str, *, limit: int, ttl_s: float) -> list[Lease]:
         """Lease pending shards. Fence and attempt grow by one with each lease of a shard.
 
-        Oldest job first, but those with shards that wait after a release come after all others: what is wrong with
-        them must not keep everybody's slots busy.
+        Whose they are is `services.store.fairness`'s matter: tenants share the slots, within a tenant priority counts.
         """
 
     def renew(self, holder: str, progress: Sequence[LeaseProgress], *, ttl_s: float) -> list[Renewal]:
@@ -296,7 +357,7 @@ class Store(Protocol):
     ) -> list[Event]: ...
 
     def counts(self) -> dict[str, dict[str, int]]:
-        """{"jobs": {state: n}, "shards": {state: n}} for the gauges."""
+        """{"jobs": {state: n}, "shards": {state: n}, "paused": {reason: n}} for the gauges."""
 
     def ping(self) -> None:
         """Raises if the database does not answer."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import logging
 import threading
 import time
@@ -23,9 +24,11 @@ from sqlalchemy import (
     event,
     func,
     insert,
+    literal,
     literal_column,
     make_url,
     select,
+    text,
 )
 from sqlalchemy.exc import DBAPIError, InterfaceError, OperationalError
 from sqlalchemy.exc import TimeoutError as PoolTimeout
@@ -39,6 +42,7 @@ _T = TypeVar("_T")
 
 _SQLITE_PATIENCE_MS = 30_000
 _WRITE = "vipe_write"
+_SCHEMA = "vipe_schema"
 # PostgreSQL asks for these transactions to be run again: serialization failure, deadlock.
 _RETRYABLE_SQLSTATES = {"40001", "40P01"}
 _MAX_ATTEMPTS = 5
@@ -78,8 +82,22 @@ class Tx:
         if self.conn.dialect.name == "postgresql":
             for job_id in sorted({e["job_id"] for e in self._events}):
                 self.conn.execute(select(func.pg_advisory_xact_lock(func.hashtextextended(job_id, 0))))
-        self.conn.execute(insert(schema.events), self._events)
+        for of_jobs, batch in itertools.groupby(self._events, key=lambda e: e["kind"].startswith("job.")):
+            if of_jobs:
+                for each in batch:
+                    self._write_job_event(each)
+            else:
+                self.conn.execute(insert(schema.events), list(batch))
         self._events.clear()
+
+    def _write_job_event(self, values: dict[str, Any]) -> None:
+        """Write an event together with its delivery, where the job has a webhook: neither exists without the other."""
+        seq = self.conn.execute(insert(schema.events).values(**values).returning(schema.events.c.seq)).scalar_one()
+        jobs, deliveries = schema.jobs.c, schema.webhook_deliveries
+        due = select(literal(seq), jobs.id, literal(self.now, schema.UtcDateTime())).where(
+            jobs.id == values["job_id"], jobs.webhook_url.is_not(None)
+        )
+        self.conn.execute(insert(deliveries).from_select(["event_seq", "job_id", "next_at"], due))
 
 
 class Database:
@@ -130,11 +148,29 @@ class Database:
                 time.sleep(0.01 * attempt)
         raise AssertionError("unreachable")
 
+    def change_schema(self, work: Callable[[Tx], None]) -> None:
+        """Run a transaction that may replace tables.
+
+        SQLite cannot change a constraint, so the table is made anew; with foreign keys on, dropping the old one would
+        delete every row that refers to it. They are off meanwhile, and checked before the commit.
+        """
+
+        def checked(tx: Tx) -> None:
+            work(tx)
+            if self.dialect == "sqlite" and (broken := tx.first(text("PRAGMA foreign_key_check"))) is not None:
+                raise RuntimeError(f"the migration left a row without the row that it refers to: {tuple(broken)}")
+
+        try:
+            self._write_once(checked, **{_SCHEMA: True})
+        except (OperationalError, InterfaceError, PoolTimeout) as error:
+            raise _unavailable(error) from error
+
     def close(self) -> None:
         self.engine.dispose()
 
-    def _write_once(self, work: Callable[[Tx], _T]) -> _T:
-        with self._turn(), self.engine.connect().execution_options(**{_WRITE: True}) as conn, conn.begin():
+    def _write_once(self, work: Callable[[Tx], _T], **options: bool) -> _T:
+        writing = {_WRITE: True, **options}
+        with self._turn(), self.engine.connect().execution_options(**writing) as conn, conn.begin():
             tx = Tx(conn, self._now(conn))
             result = work(tx)
             tx.flush_events()
@@ -174,15 +210,17 @@ def _prepare_sqlite(engine: Engine) -> None:
             f"busy_timeout = {_SQLITE_PATIENCE_MS}",
             "journal_mode = WAL",
             "synchronous = NORMAL",
-            "foreign_keys = ON",
         ):
             cursor.execute(f"PRAGMA {pragma}")
         cursor.close()
 
     @event.listens_for(engine, "begin")
     def on_begin(conn: Connection) -> None:
+        options = conn.get_execution_options()
+        # This pragma does nothing inside of a transaction, so every transaction sets it to what it needs.
+        conn.exec_driver_sql(f"PRAGMA foreign_keys = {'OFF' if options.get(_SCHEMA) else 'ON'}")
         # A writer that starts as a reader and is overtaken fails at once, without waiting: so it locks from the start.
-        conn.exec_driver_sql("BEGIN IMMEDIATE" if conn.get_execution_options().get(_WRITE) else "BEGIN")
+        conn.exec_driver_sql("BEGIN IMMEDIATE" if options.get(_WRITE) else "BEGIN")
 
 
 def _sqlstate(error: Exception) -> str | None:

@@ -9,13 +9,16 @@ from typing import Any
 from sqlalchemy import Row, and_, func, insert, select, update
 from ulid import ULID
 
+from services.domain.control import JobControl
 from services.domain.errors import InvalidTransition, JobNotCancellable, JobNotFound, OutputInUse
 from services.domain.events import EventKind, job_event
 from services.domain.models import JobSpec
 from services.domain.states import JOB_TRANSITIONS, JobState, ShardState
 from services.store.base import Deferral
 from services.store.database import Tx
+from services.store.rows import control_columns
 from services.store.schema import in_state, jobs, shards
+from services.store.tenants import admit, make_known
 
 # Serialises the creation of jobs in PostgreSQL, so that ids grow and the check of the output cannot be overtaken.
 _CREATE_LOCK = 0x6A6F6273
@@ -73,11 +76,11 @@ def canonical_output(output: str) -> str:
     return posixpath.normpath(output)
 
 
-def create_job(tx: Tx, spec: JobSpec, tenant: str) -> str:
+def create_job(tx: Tx, spec: JobSpec, control: JobControl, tenant: str) -> str:
     """A new job; gives its id.
 
     Raises:
-        OutputInUse: See `Store.create_job`.
+        InvalidRequest, OutputInUse, QuotaExceeded: See `Store.create_job`.
     """
     if tx.conn.dialect.name == "postgresql":
         tx.run(select(func.pg_advisory_xact_lock(_CREATE_LOCK)))
@@ -93,6 +96,8 @@ def create_job(tx: Tx, spec: JobSpec, tenant: str) -> str:
             "and stays with the first job that wrote to it; choose another folder"
         )
 
+    make_known(tx, tenant)
+    admit(tx, tenant, jobs_more=1, videos_more=0)
     job_id = _next_id(tx)
     tx.run(
         insert(jobs).values(
@@ -103,6 +108,7 @@ def create_job(tx: Tx, spec: JobSpec, tenant: str) -> str:
             state=JobState.QUEUED.value,
             created_at=tx.now,
             updated_at=tx.now,
+            **control_columns(control, tx.now),
         )
     )
     tx.emit(job_id, EventKind.JOB_QUEUED, name=spec.name)
@@ -195,8 +201,9 @@ def finish_job(tx: Tx, job_id: str) -> None:
 
 
 def finish_sweep(tx: Tx, job_id: str) -> None:
-    """See `Store.finish_sweep`."""
-    lock_job(tx, job_id)
+    """See `Store.finish_sweep`. A job that was retried meanwhile is swept again when it ends."""
+    if not JobState(lock_job(tx, job_id).state).terminal:
+        return
     tx.run(update(jobs).where(jobs.c.id == job_id).values(swept=True, **NO_FAILURES))
 
 

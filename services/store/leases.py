@@ -11,10 +11,10 @@ import math
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
-from datetime import timedelta
-from typing import Any
+from datetime import datetime, timedelta
+from typing import Any, Literal
 
-from sqlalchemy import Row, bindparam, exists, or_, select, update
+from sqlalchemy import Row, bindparam, select, update
 
 from services.domain.errors import CommitConflict, ShardNotFound
 from services.domain.events import EventKind
@@ -28,7 +28,9 @@ from services.domain.models import (
     VideoRef,
 )
 from services.domain.states import JobState, ShardState, VideoStatus
+from services.store.control import trip
 from services.store.database import Tx
+from services.store.fairness import lock_claimable
 from services.store.jobs import lock_job, settle_cancelling
 from services.store.schema import in_state, jobs, shards, videos
 
@@ -44,11 +46,14 @@ _NO_LEASE: dict[str, Any] = {
 }
 
 
+_VERDICTS: dict[JobState, Literal["continue", "pause"]] = {JobState.RUNNING: "continue", JobState.PAUSED: "pause"}
+
+
 def claim(tx: Tx, holder: str, limit: int, ttl_s: float) -> list[Lease]:
     """See `Store.claim`."""
     if limit <= 0:
         return []
-    chosen = _lock_claimable(tx, limit)
+    chosen = lock_claimable(tx, limit)
     if not chosen:
         return []
     tx.run(
@@ -99,38 +104,11 @@ def claim(tx: Tx, holder: str, limit: int, ttl_s: float) -> list[Lease]:
                 expires_at=s.lease_expires_at,
                 spent=spent.get(s.id, {}),
                 create_once=create_once[s.job_id],
+                retry=s.retry,
             )
         )
         tx.emit(s.job_id, EventKind.SHARD_LEASED, shard_id=s.id, holder=holder, attempt=s.attempts, fence=s.fence)
     return leases
-
-
-def _lock_claimable(tx: Tx, limit: int) -> list[str]:
-    """Pending shards of running jobs, those that wait and those that another claim holds left out.
-
-    Jobs with shards that wait come last, else the oldest is first. Job by job, so that each query reads `limit` entries
-    of an index instead of sorting all that is pending.
-    """
-    pending = in_state(shards.c.state, ShardState.PENDING)
-    ready = or_(shards.c.not_before.is_(None), shards.c.not_before <= tx.now)
-    with_work = (
-        select(jobs.c.id)
-        .where(jobs.c.state == JobState.RUNNING.value, exists().where(shards.c.job_id == jobs.c.id, pending))
-        .order_by(exists().where(shards.c.job_id == jobs.c.id, pending, shards.c.not_before > tx.now), jobs.c.id)
-    )
-    chosen: list[str] = []
-    for job_id in tx.run(with_work).scalars().all():
-        free = (
-            select(shards.c.id)
-            .where(shards.c.job_id == job_id, pending, ready)
-            .order_by(shards.c.ordinal)
-            .limit(limit - len(chosen))
-            .with_for_update(skip_locked=True)
-        )
-        chosen += tx.run(free).scalars()
-        if len(chosen) == limit:
-            break
-    return chosen
 
 
 def renew(tx: Tx, holder: str, progress: Sequence[LeaseProgress], ttl_s: float) -> list[Renewal]:
@@ -153,8 +131,7 @@ def renew(tx: Tx, holder: str, progress: Sequence[LeaseProgress], ttl_s: float) 
             renewals.append(Renewal(report.shard_id, "lost"))
             continue
         held.append(report)
-        running = JobState(row.job_state) is JobState.RUNNING
-        renewals.append(Renewal(report.shard_id, "continue" if running else "cancel"))
+        renewals.append(Renewal(report.shard_id, _VERDICTS.get(JobState(row.job_state), "cancel")))
     if held:
         tx.run(
             update(shards)
@@ -239,7 +216,7 @@ def expire_job(tx: Tx, job_id: str) -> int:
         .with_for_update()
     )
     for row in expired:
-        _end_lease(tx, row, EventKind.SHARD_EXPIRED)
+        _end_lease(tx, row, EventKind.SHARD_EXPIRED, ended=row.lease_expires_at)
     settle_cancelling(tx, job_id)
     return len(expired)
 
@@ -265,13 +242,17 @@ def record_commit(tx: Tx, record: CommitRecord) -> bool:
         CommitConflict: The record is not one of this shard's plan and leases.
     """
     row = lock_shard(tx, record.shard_id)
-    keys = set(tx.run(select(videos.c.key).where(videos.c.shard_id == row.id)).scalars())
-    if record.plan_hash != row.plan_hash or {v.key for v in record.videos} != keys or len(record.videos) != len(keys):
+    if record.plan_hash != row.plan_hash:
         raise CommitConflict(f"the commit record of shard {row.id} belongs to another plan; its output is shared")
     if record.fence > row.fence or record.job_id != row.job_id:
         raise CommitConflict(f"the commit record of shard {row.id} was written without a lease of this store")
     if ShardState(row.state) is ShardState.COMMITTED:
-        return False
+        return False  # Some of its videos may have been tried again since, and belong to another shard now.
+    keys = set(tx.run(select(videos.c.key).where(videos.c.shard_id == row.id)).scalars())
+    if {v.key for v in record.videos} != keys or len(record.videos) != len(keys) or record.retry != row.retry:
+        raise CommitConflict(f"the commit record of shard {row.id} belongs to another plan; its output is shared")
+    outcomes = Counter(v.status for v in record.videos)
+    lost = outcomes[VideoStatus.FAILED] + outcomes[VideoStatus.QUARANTINED]
     tx.run(
         update(shards)
         .where(shards.c.id == row.id)
@@ -282,6 +263,7 @@ def record_commit(tx: Tx, record: CommitRecord) -> bool:
             committed_at=tx.now,
             record=None,  # it lies in the output
             record_sha256=hashlib.sha256(record.to_bytes()).hexdigest(),
+            videos_lost=lost,
         )
     )
     tx.run(
@@ -298,7 +280,6 @@ def record_commit(tx: Tx, record: CommitRecord) -> bool:
             for v in record.videos
         ],
     )
-    outcomes = Counter(v.status for v in record.videos)
     tx.run(
         update(jobs)
         .where(jobs.c.id == row.job_id)
@@ -308,6 +289,7 @@ def record_commit(tx: Tx, record: CommitRecord) -> bool:
             videos_failed=jobs.c.videos_failed + outcomes[VideoStatus.FAILED],
             videos_quarantined=jobs.c.videos_quarantined + outcomes[VideoStatus.QUARANTINED],
             frames_committed=jobs.c.frames_committed + record.frames,
+            slot_seconds=jobs.c.slot_seconds + _lasted_s(row, tx.now),
             updated_at=tx.now,
         )
     )
@@ -321,6 +303,8 @@ def record_commit(tx: Tx, record: CommitRecord) -> bool:
         **{status.value: outcomes[status] for status in VideoStatus if status is not VideoStatus.PENDING},
     )
     settle_cancelling(tx, row.job_id)
+    if lost:
+        trip(tx, row.job_id)
     return True
 
 
@@ -344,15 +328,30 @@ def lock_shard(tx: Tx, shard: str) -> Row[Any]:
     return tx.run(select(shards).where(shards.c.id == shard).with_for_update()).one()
 
 
-def _end_lease(tx: Tx, row: Row[Any], kind: EventKind, wait_s: float = 0.0, **data: Any) -> None:
-    """Pending again, or cancelled where the job takes no more leases."""
+def _end_lease(
+    tx: Tx, row: Row[Any], kind: EventKind, wait_s: float = 0.0, ended: datetime | None = None, **data: Any
+) -> None:
+    """Pending again, or cancelled where the job takes no more leases. What the lease cost is the job's.
+
+    Args:
+        ended: Until when its holder may have worked; now, where it says itself that it has stopped.
+    """
     job_state = JobState(tx.run(select(jobs.c.state).where(jobs.c.id == row.job_id)).scalar_one())
-    to = ShardState.PENDING if job_state is JobState.RUNNING else ShardState.CANCELLED
+    to = ShardState.PENDING if job_state in (JobState.RUNNING, JobState.PAUSED) else ShardState.CANCELLED
     changes = {**_NO_LEASE, "state": to.value}
     if wait_s > 0:
         changes["not_before"] = tx.now + timedelta(seconds=wait_s)
     tx.run(update(shards).where(shards.c.id == row.id).values(**changes))
+    lasted_s = _lasted_s(row, ended or tx.now)
+    tx.run(update(jobs).where(jobs.c.id == row.job_id).values(slot_seconds=jobs.c.slot_seconds + lasted_s))
     tx.emit(row.job_id, kind, shard_id=row.id, holder=row.holder, fence=row.fence, **data)
+
+
+def _lasted_s(row: Row[Any], until: datetime) -> float:
+    """How long a shard's lease has lasted; 0 where it has none."""
+    if ShardState(row.state) is not ShardState.LEASED or row.leased_at is None:
+        return 0.0
+    return max(0.0, float((until - row.leased_at).total_seconds()))
 
 
 def _storable(value: Any) -> Any:

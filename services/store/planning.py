@@ -11,13 +11,16 @@ from typing import Any
 
 from sqlalchemy import Row, insert, select, update
 
-from services.domain.errors import InvalidTransition
+from services.domain.control import PauseReason
+from services.domain.errors import InvalidTransition, QuotaExceeded
 from services.domain.events import EventKind
 from services.domain.models import ShardPlan, shard_id
 from services.domain.states import JobState, ShardState, VideoStatus
+from services.store.control import pause
 from services.store.database import Tx
 from services.store.jobs import NO_FAILURES, is_planned_by, lock_job, move_job
 from services.store.schema import jobs, shards, videos
+from services.store.tenants import admit
 
 
 def begin(tx: Tx, job_id: str, holder: str, ttl_s: float) -> int | None:
@@ -54,9 +57,14 @@ def add_shards(tx: Tx, job_id: str, fence: int, plans: Iterable[ShardPlan], ttl_
     new = _not_there_yet(tx, job, plans)
     if not new:
         return True
-    tx.run(insert(shards), [_shard_row(job_id, plan) for plan in new])
-    tx.run(insert(videos), [row for plan in new for row in _video_rows(job_id, plan)])
     num_videos = sum(len(plan.videos) for plan in new)
+    try:
+        admit(tx, job.tenant, jobs_more=0, videos_more=num_videos)
+    except QuotaExceeded as error:
+        pause(tx, job, PauseReason.TENANT_VIDEOS, str(error))
+        return False
+    tx.run(insert(shards), [shard_row(job_id, plan) for plan in new])
+    tx.run(insert(videos), [row for plan in new for row in _video_rows(job_id, plan)])
     totals = {"shards_total": jobs.c.shards_total + len(new), "videos_total": jobs.c.videos_total + num_videos}
     _change(tx, job_id, **totals, **NO_FAILURES)
     tx.emit(job_id, EventKind.SHARDS_PLANNED, shards=len(new), videos=num_videos)
@@ -90,7 +98,7 @@ def _not_there_yet(tx: Tx, job: Row[Any], plans: Iterable[ShardPlan]) -> Sequenc
     return [plan for _, plan in sorted(wanted.items())]
 
 
-def _shard_row(job_id: str, plan: ShardPlan) -> dict[str, Any]:
+def shard_row(job_id: str, plan: ShardPlan) -> dict[str, Any]:
     return {
         "id": shard_id(job_id, plan.ordinal),
         "job_id": job_id,

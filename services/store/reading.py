@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from datetime import datetime, timedelta
 from typing import Any
 
 from sqlalchemy import ColumnElement, Row, Select, and_, exists, func, or_, select
 
+from services.domain.control import PauseReason
 from services.domain.errors import InvalidPageToken, JobNotFound
 from services.domain.models import (
     Event,
@@ -23,6 +25,7 @@ from services.domain.states import JobState, ShardState, VideoStatus
 from services.store.base import VideoRow
 from services.store.database import Tx
 from services.store.jobs import owns
+from services.store.rows import control_of
 from services.store.schema import events, in_state, jobs, shards, videos
 
 # The recent past over which frames per second are counted.
@@ -164,6 +167,12 @@ def shard_digests(tx: Tx, job_id: str, first_ordinal: int, limit: int) -> list[S
     ]
 
 
+def job_states(tx: Tx, job_ids: Collection[str]) -> dict[str, JobState]:
+    """See `Store.job_states`."""
+    found = tx.rows(select(jobs.c.id, jobs.c.state).where(jobs.c.id.in_(sorted(job_ids))))
+    return {row.id: JobState(row.state) for row in found}
+
+
 def list_events(tx: Tx, job_id: str, tenant: str | None, after_seq: int, limit: int) -> list[Event]:
     """See `Store.events`."""
     _require_job(tx, job_id, tenant)
@@ -180,6 +189,10 @@ def counts(tx: Tx) -> dict[str, dict[str, int]]:
     for name, table in (("jobs", jobs), ("shards", shards)):
         for row in tx.rows(select(table.c.state, func.count().label("number")).group_by(table.c.state)):
             answer[name][row.state] = row.number
+    paused = select(jobs.c.pause_reason, func.count().label("number")).where(jobs.c.state == JobState.PAUSED.value)
+    answer["paused"] = {reason.value: 0 for reason in PauseReason}
+    for row in tx.rows(paused.group_by(jobs.c.pause_reason)):
+        answer["paused"][row.pause_reason] = row.number
     return answer
 
 
@@ -197,6 +210,7 @@ def _require_job(tx: Tx, job_id: str, tenant: str | None) -> None:
 
 
 def _job(tx: Tx, row: Row[Any]) -> Job:
+    progress, live_slot_s = _progress(tx, row)
     return Job(
         id=row.id,
         spec=JobSpec.from_json(row.spec),
@@ -209,7 +223,12 @@ def _job(tx: Tx, row: Row[Any]) -> Job:
         planned=row.planned,
         started_at=row.started_at,
         finished_at=row.finished_at,
-        progress=_progress(tx, row),
+        control=control_of(row),
+        pause_reason=row.pause_reason,
+        pause_message=row.pause_message,
+        slot_seconds=row.slot_seconds + live_slot_s,
+        retries=row.retries,
+        progress=progress,
     )
 
 
@@ -227,8 +246,8 @@ def _shard(row: Row[Any]) -> Shard:
     )
 
 
-def _progress(tx: Tx, job: Row[Any]) -> JobProgress:
-    """The job's counters plus what live leases report."""
+def _progress(tx: Tx, job: Row[Any]) -> tuple[JobProgress, float]:
+    """The job's counters plus what live leases report, and the seconds that these have lasted."""
     settled = job.videos_succeeded + job.videos_failed + job.videos_quarantined
     base: dict[str, Any] = {
         "shards_total": job.shards_total,
@@ -240,7 +259,8 @@ def _progress(tx: Tx, job: Row[Any]) -> JobProgress:
     }
     if JobState(job.state) in (JobState.QUEUED, JobState.FINALIZING) or JobState(job.state).terminal:
         frames = job.frames_committed
-        return JobProgress(**base, videos_done=settled, frames_done=frames, frames_expected=frames if settled else None)
+        expected = frames if settled else None
+        return JobProgress(**base, videos_done=settled, frames_done=frames, frames_expected=expected), 0.0
 
     c = shards.c
     reported = (c.state, c.num_videos, c.videos_done, c.frames_done, c.frames_expected)
@@ -263,7 +283,7 @@ def _progress(tx: Tx, job: Row[Any]) -> JobProgress:
     elif job.planned and videos_done and job.started_at is not None:
         elapsed = (tx.now - job.started_at).total_seconds()
         eta_s = elapsed / videos_done * (job.videos_total - videos_done)
-    return JobProgress(
+    progress = JobProgress(
         **base,
         videos_done=videos_done,
         frames_done=frames_done,
@@ -271,6 +291,7 @@ def _progress(tx: Tx, job: Row[Any]) -> JobProgress:
         frames_per_s=rate,
         eta_s=eta_s,
     )
+    return progress, sum((tx.now - s.leased_at).total_seconds() for s in leased if s.leased_at is not None)
 
 
 def _expected_frames(job: Row[Any], leased: list[Row[Any]], settled: int) -> int | None:

@@ -14,6 +14,7 @@ from sqlalchemy import (
     ColumnElement,
     DateTime,
     Dialect,
+    Float,
     ForeignKey,
     Index,
     Integer,
@@ -104,6 +105,19 @@ jobs = Table(
     Column("started_at", UtcDateTime),
     Column("finished_at", UtcDateTime),
     Column("swept", Boolean, nullable=False, server_default=text("false")),  # its output is rid of rubbish
+    # How it is run; see `services.domain.control`.
+    Column("priority", Integer, nullable=False, server_default=text("0")),
+    Column("deadline", UtcDateTime),
+    Column("max_slot_seconds", Float),
+    Column("max_failure_ratio", Float),
+    Column("failure_window", Integer, nullable=False, server_default=text("200")),
+    Column("failures_since", UtcDateTime),  # what was settled before does not count as failing any more
+    Column("webhook_url", Text),
+    Column("webhook_secret", String(128)),
+    Column("pause_reason", String(32)),
+    Column("pause_message", Text),
+    Column("slot_seconds", Float, nullable=False, server_default=text("0")),  # of leases that have ended
+    Column("retries", Integer, nullable=False, server_default=text("0")),
     # Counters, kept by the transactions that change what they count.
     _count("shards_total"),
     _count("shards_committed"),
@@ -124,6 +138,18 @@ jobs = Table(
         sqlite_where=text("state NOT IN ('failed', 'cancelled') OR shards_total > 0"),
         postgresql_where=text("state NOT IN ('failed', 'cancelled') OR shards_total > 0"),
     ),
+)
+
+tenants = Table(
+    "tenants",
+    metadata,
+    Column("name", String(64), primary_key=True),
+    Column("own_limits", Boolean, nullable=False, server_default=text("false")),
+    Column("weight", Float, nullable=False, server_default=text("1")),
+    Column("max_slots", Integer),
+    Column("max_jobs", Integer),
+    Column("max_videos", Integer),
+    Column("served_at", UtcDateTime),  # when it got its last lease
 )
 
 idempotency_keys = Table(
@@ -198,6 +224,8 @@ shards = Table(
     Column("committed_at", UtcDateTime),
     Column("record", Text),  # decided here and not known to lie in the output; see `services.store.commits`
     Column("record_sha256", String(64)),
+    Column("videos_lost", Integer, nullable=False, server_default=text("0")),  # failed and quarantined ones in it
+    Column("retry", Integer, nullable=False, server_default=text("0")),  # which retry of the job made it
     _one_of("state", ShardState),
     UniqueConstraint("job_id", "ordinal"),
     Index("ix_shards_job_id_state_ordinal", "job_id", "state", "ordinal"),
@@ -263,4 +291,23 @@ events = Table(
     Column("data", Json, nullable=False),
     Index("ix_events_job_id_seq", "job_id", "seq"),
     sqlite_autoincrement=True,
+)
+
+# Events that a webhook was not told about yet: written with the event, so neither is lost without the other.
+webhook_deliveries = Table(
+    "webhook_deliveries",
+    metadata,
+    Column("event_seq", ForeignKey("events.seq", ondelete="CASCADE"), primary_key=True, autoincrement=False),
+    Column("job_id", ForeignKey("jobs.id", ondelete="CASCADE"), nullable=False),
+    Column("attempts", Integer, nullable=False, server_default=text("0")),
+    Column("next_at", UtcDateTime),  # when it is sent (again); none once it was taken or given up
+    Column("delivered_at", UtcDateTime),
+    Column("last_error", Text),
+    Index("ix_webhook_deliveries_job_id", "job_id"),
+    Index(
+        "ix_webhook_deliveries_due",
+        "next_at",
+        sqlite_where=text("next_at IS NOT NULL"),
+        postgresql_where=text("next_at IS NOT NULL"),
+    ),
 )

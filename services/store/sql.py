@@ -1,4 +1,4 @@
-"""The store on SQLAlchemy: each method is one transaction of `jobs`, `planning`, `leases` or `reading`."""
+"""The store on SQLAlchemy: each method is one transaction of one of its modules."""
 
 from __future__ import annotations
 
@@ -6,13 +6,14 @@ import hashlib
 import json
 import logging
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from functools import partial
 
 from pydantic import TypeAdapter
 from sqlalchemy import select
 
 from services.domain.access import ALL_SCOPES, DEFAULT_TENANT, ApiKey, AuditEntry, AuditEvent, Scope
+from services.domain.control import DEFAULT_CONTROL, Changes, Delivery, JobControl, RetrySelection, Tenant, TenantLimits
 from services.domain.errors import StoreUnavailable
 from services.domain.keys import hash_key, new_key
 from services.domain.models import (
@@ -31,7 +32,23 @@ from services.domain.models import (
 )
 from services.domain.redaction import redact
 from services.domain.states import JobState, VideoStatus
-from services.store import audit, commits, idempotency, jobs, keys, leases, migrations, planning, reading
+from services.store import (
+    audit,
+    commits,
+    idempotency,
+    jobs,
+    keys,
+    leases,
+    migrations,
+    outbox,
+    planning,
+    reading,
+    retries,
+    tenants,
+)
+from services.store import (
+    control as controls,
+)
 from services.store.base import Deferral, VideoRow
 from services.store.database import Database, Tx
 
@@ -84,19 +101,21 @@ class SqlStore:
         self,
         spec: JobSpec,
         *,
+        control: JobControl = DEFAULT_CONTROL,
         tenant: str = DEFAULT_TENANT,
         idempotency_key: str | None = None,
         request_hash: str | None = None,
     ) -> tuple[Job, bool]:
         def create(tx: Tx) -> tuple[Job, bool]:
             if idempotency_key is None:
-                return reading.get_job(tx, jobs.create_job(tx, spec, tenant)), True
-            request = request_hash or hashlib.sha256(json.dumps(spec.to_json(), sort_keys=True).encode()).hexdigest()
+                return reading.get_job(tx, jobs.create_job(tx, spec, control, tenant)), True
+            wanted = json.dumps([spec.to_json(), control.to_json()], sort_keys=True)
+            request = request_hash or hashlib.sha256(wanted.encode()).hexdigest()
             idempotency.hold(tx, tenant, idempotency_key)
             known = idempotency.answer_of(tx, tenant, idempotency_key, request)
             if known is not None:
                 return _JOBS.validate_python(known), False
-            job = reading.get_job(tx, jobs.create_job(tx, spec, tenant))
+            job = reading.get_job(tx, jobs.create_job(tx, spec, control, tenant))
             idempotency.keep_answer(tx, tenant, idempotency_key, request, _JOBS.dump_python(job, mode="json"))
             return job, True
 
@@ -118,6 +137,47 @@ class SqlStore:
     def request_cancel(self, job_id: str, *, tenant: str | None = None) -> Job:
         self._db.write(lambda tx: jobs.request_cancel(tx, job_id, tenant))
         return self.get_job(job_id)
+
+    # Control --------------------------------------------------------------------------------------------------------
+    def change_job(self, job_id: str, changes: Changes, *, tenant: str | None = None) -> Job:
+        self._db.write(lambda tx: controls.change_job(tx, job_id, tenant, changes))
+        return self.get_job(job_id)
+
+    def request_pause(self, job_id: str, *, tenant: str | None = None) -> Job:
+        self._db.write(lambda tx: controls.request_pause(tx, job_id, tenant))
+        return self.get_job(job_id)
+
+    def resume(self, job_id: str, *, tenant: str | None = None) -> Job:
+        self._db.write(lambda tx: controls.resume(tx, job_id, tenant))
+        return self.get_job(job_id)
+
+    def retry(self, job_id: str, selection: RetrySelection, *, tenant: str | None = None) -> Job:
+        self._db.write(lambda tx: retries.retry(tx, job_id, tenant, selection))
+        return self.get_job(job_id)
+
+    def pause_over_limits(self) -> int:
+        suspects = self._db.read(lambda tx: list(tx.run(controls.over_limits(tx.now)).scalars()))
+        return sum(self._db.write(partial(controls.pause_over_limit, job_id=job_id)) for job_id in suspects)
+
+    def job_states(self, job_ids: Collection[str]) -> dict[str, JobState]:
+        return self._db.read(lambda tx: reading.job_states(tx, job_ids)) if job_ids else {}
+
+    # Tenants --------------------------------------------------------------------------------------------------------
+    def list_tenants(self) -> list[Tenant]:
+        return self._db.read(tenants.list_tenants)
+
+    def set_tenant_limits(self, name: str, limits: TenantLimits | None) -> None:
+        self._db.write(lambda tx: tenants.set_limits(tx, name, limits))
+
+    # Webhooks -------------------------------------------------------------------------------------------------------
+    def take_deliveries(self, *, limit: int, ttl_s: float) -> list[Delivery]:
+        return self._db.write(lambda tx: outbox.take(tx, limit, ttl_s)) if self.undelivered() else []
+
+    def settle_delivery(self, delivery: Delivery, *, error: str | None, retry_in_s: float | None) -> None:
+        self._db.write(lambda tx: outbox.settle(tx, delivery, error, retry_in_s))
+
+    def undelivered(self) -> int:
+        return self._db.read(outbox.undelivered)
 
     # Planning -------------------------------------------------------------------------------------------------------
     def next_unplanned(self, holder: str) -> Job | None:

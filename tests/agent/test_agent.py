@@ -8,6 +8,7 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -182,6 +183,44 @@ def test_jobs_run_side_by_side_and_a_bad_one_harms_nobody(world: World) -> None:
     assert world.store.get_job(blocked).state is not JobState.SUCCEEDED
 
 
+def test_a_paused_job_stops_at_once_keeps_what_is_finished_and_goes_on(world: World, tmp_path: Path) -> None:
+    """Within seconds, although the next renewal is far away; no video that was finished is computed again."""
+    slow_renewals = replace(world.config, lease_ttl_s=600.0, slots=1)
+    world.agent = Agent(world.store, slow_renewals, ThreadExecutor(slow_renewals), world.metrics)
+    log = tmp_path / "opened"
+    # The first eight shards of a job hold one video each; the last two share the ninth.
+    scripts = {
+        **{str(n): "frames=2" for n in range(8)},
+        "a": f"frames=2 count={log}",
+        "b": f"frames=2 slow=30 count={log}",
+    }
+    job_id = world.submit("job", scripts)
+    world.agent.start()
+    world.wait(lambda: log.exists() and len(log.read_text().splitlines()) == 2, "the second video to begin")
+    paused_s = time.monotonic()
+    world.store.request_pause(job_id)
+    world.wait(lambda: world.store.list_shards(job_id)[0][8].state is ShardState.PENDING, "the shard to be given back")
+    assert time.monotonic() - paused_s < 30
+    (world.root / "job" / "b.mp4").write_text("frames=2")
+    world.store.resume(job_id)
+    assert world.ended(job_id) is JobState.SUCCEEDED
+    assert [line.split("-")[0] for line in log.read_text().splitlines()] == ["a", "b"], "a is not computed again"
+    rows = world.store.list_videos(job_id)[0]
+    assert [row.result.attempt for row in rows if row.result is not None] == [1] * 9 + [2]
+    assert world.store.get_job(job_id).slot_seconds > 0
+
+
+def test_a_cancelled_job_stops_before_its_next_renewal(world: World, tmp_path: Path) -> None:
+    slow_renewals = replace(world.config, lease_ttl_s=600.0, slots=1)
+    world.agent = Agent(world.store, slow_renewals, ThreadExecutor(slow_renewals), world.metrics)
+    log = tmp_path / "opened"
+    job_id = world.submit("job", {"a": f"slow=600 count={log}"})
+    world.agent.start()
+    world.wait(log.exists, "the video to begin")
+    world.store.request_cancel(job_id)
+    assert world.ended(job_id) is JobState.CANCELLED
+
+
 def test_a_job_whose_output_is_down_keeps_no_slot_from_the_others(
     world: World, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -324,7 +363,7 @@ def test_an_index_that_cannot_be_written_yet_is_written_later(world: World, monk
     monkeypatch.setattr(services.dataset, "finalise", stumbling)
     world.agent.start()
     assert world.ended(job_id) is JobState.SUCCEEDED
-    assert world.metric("vipe_stage_duration_seconds_count", stage="finalise") == 1
+    world.wait(lambda: world.metric("vipe_stage_duration_seconds_count", stage="finalise") == 1, "the metric behind it")
 
 
 def test_ten_thousand_failures_in_a_row_are_waited_out() -> None:

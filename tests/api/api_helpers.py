@@ -81,6 +81,7 @@ def commit(store: Store, lease: Lease, *failed: str) -> None:
             tar_name=f"tar-{lease.ordinal}",
             objects=(),
             videos=tuple(results),
+            retry=lease.retry,
         )
     )
 

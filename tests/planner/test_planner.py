@@ -398,6 +398,28 @@ class TestJobs:
         cancelling.close()
         assert store.get_job(job_id).state is JobState.CANCELLED
         assert planned(store, job_id) == []
+        next_id = submit(store, tmp_path / "out", videos)
+        assert plan_next(store, "planner")
+        assert store.get_job(next_id).planned, "a job that ended without shards leaves its output to the next"
+        assert json.loads((tmp_path / "out" / CLAIM_KEY).read_text())["job_id"] == next_id
+
+    def test_a_claim_that_is_written_after_its_job_was_cancelled(
+        self, store: SqlStore, videos: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        make(videos, "a.mp4")
+        cancelled = submit(store, tmp_path / "out", videos)
+        store.request_cancel(cancelled)
+        job_id = submit(store, tmp_path / "out", videos)
+        late = [cancelled]
+
+        def claim(output: ObjectStore, job_id: str, *, create_once: bool) -> None:
+            if late:
+                claim_output(output, late.pop(), create_once=create_once)
+            claim_output(output, job_id, create_once=create_once)
+
+        monkeypatch.setattr("services.planner.planning.claim_output", claim)
+        assert plan_next(store, "planner")
+        assert store.get_job(job_id).planned
 
 
 @pytest.fixture(scope="module")

@@ -38,6 +38,7 @@ def record(
     frames: int = 10,
     fence: int | None = None,
     plan_hash: str | None = None,
+    error_code: str = "media_corrupt",
 ) -> CommitRecord:
     failed = status is not VideoStatus.SUCCEEDED
     return CommitRecord(
@@ -57,7 +58,7 @@ def record(
                 v.uri,
                 status,
                 lease.attempt,
-                error_code="media_corrupt" if failed else None,
+                error_code=error_code if failed else None,
                 error_message="broken" if failed else None,
                 num_frames=None if failed else frames,
                 camera_params=None if failed else (1.0, 2.0, 3.0, 4.0),
@@ -65,4 +66,5 @@ def record(
             )
             for v in lease.videos
         ),
+        retry=lease.retry,
     )

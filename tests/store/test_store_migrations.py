@@ -42,7 +42,7 @@ def test_the_migrated_schema_is_the_codes(new_store_url: Callable[[], str]) -> N
         checks = {c["name"] for table in metadata.tables for c in inspect(conn).get_check_constraints(table)}
     assert checks == {"ck_jobs_state", "ck_shards_state", "ck_videos_status"}
     assert _indexes(database) == _indexes(created)
-    assert sum("where=" in index for index in _indexes(database)) == 5
+    assert sum("where=" in index for index in _indexes(database)) == 6
     database.close()
     created.close()
 

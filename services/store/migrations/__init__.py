@@ -32,7 +32,7 @@ def upgrade(database: Database, revision: str = "head") -> None:
         config.attributes["connection"] = tx.conn
         command.upgrade(config, revision)
 
-    database.write(work)
+    database.change_schema(work)
 
 
 def current(database: Database) -> str | None:
