@@ -172,10 +172,10 @@ def blame(tx: Tx, shard: str, fence: int, video_key: str, death: Death) -> tuple
     video = tx.first(
         select(videos.c.deaths, videos.c.death_log).where(videos.c.shard_id == shard, videos.c.key == video_key)
     )
+    if not is_current(row, fence):
+        return () if video is None else _deaths(video)  # It may have been tried again, in another shard, since.
     if video is None:
         raise ShardNotFound(f"shard {shard} has no video {video_key!r}")
-    if not is_current(row, fence):
-        return _deaths(video)
     deaths = (*_deaths(video), replace(death, at=tx.now.isoformat()))
     log = [_storable(each.to_json()) for each in deaths]
     tx.run(

@@ -10,13 +10,13 @@ from pathlib import Path
 import pyarrow.parquet as pq
 import pytest
 import yaml
-from shard_factory import ATTRIBUTES, JOB, commit_shard, make_lease, success
+from shard_factory import ATTRIBUTES, JOB, commit_shard, failure, make_lease, success, write_artifacts
 
 from services.commit import committed_records
-from services.dataset import finalise
+from services.dataset import finalise, iterate, read_one, verify
 from services.dataset.schema import meta_schema, public_spec, public_uri
 from services.domain.errors import IntegrityError
-from services.domain.models import JobSpec
+from services.domain.models import JobSpec, VideoResult
 from services.storage import DirectoryStore, ObjectStore
 
 SPEC = JobSpec(inputs=("/in",), output="/out", attributes=ATTRIBUTES, name='Three "animals"')
@@ -167,3 +167,62 @@ def test_addresses_are_published_without_secrets(uri: str, public: str) -> None:
     assert public_uri(uri) == public
     spec = dataclasses.replace(SPEC, inputs=(uri,))
     assert public_spec(spec)["inputs"] == [public]
+
+
+class TestRetries:
+    """A later retry's row takes the place of a failure, and of nothing else."""
+
+    @pytest.fixture
+    def retried(self, finished: DirectoryStore, engine_output: Path, tmp_path: Path) -> DirectoryStore:
+        """`bad-1` succeeds at last, `poison-3` fails again in another way, `bad-2` was not tried again."""
+        artifacts = tmp_path / "more"
+        write_artifacts(artifacts, "bad-1", 2, info=True)
+        for ordinal, result in ((3, success("bad-1", 2)), (4, failure("poison-3"))):
+            lease = dataclasses.replace(make_lease([result.key], ordinal=ordinal), retry=1)
+            commit_shard(lease, [result], artifacts, tmp_path / "s", finished, lambda: True)
+        return finished
+
+    def test_every_video_is_counted_once_with_its_last_outcome(self, retried: DirectoryStore) -> None:
+        totals = finalise(retried, JOB, SPEC, num_shards=5, num_videos=6)
+        assert (totals.videos, totals.succeeded, totals.failed, totals.quarantined) == (6, 4, 2, 0)
+        assert (totals.shards, totals.superseded) == (5, 2)
+        assert sorted(_table(retried, "meta.parquet")["sequence"].to_pylist()) == ["ant-2", "bad-1", "cat-1", "dog-3"]
+        rows = _table(retried, "failures.parquet").to_pylist()
+        assert [(r["sequence"], r["status"], r["shard_id"][-1]) for r in rows] == [
+            ("bad-2", "failed", "1"),
+            ("poison-3", "failed", "4"),
+        ]
+        report = verify(retried, deep=True)
+        assert report.ok, report.problems
+        assert report.totals == totals
+        assert read_one(retried, "bad-1").num_frames == 2
+        assert {sample.key for sample in iterate(retried)} == {"ant-2", "bad-1", "cat-1", "dog-3"}
+
+    def test_until_it_is_finalised_again_the_description_is_older_than_the_records(
+        self, retried: DirectoryStore
+    ) -> None:
+        assert not verify(retried).ok
+
+    @pytest.mark.parametrize(
+        ("result", "retry"),
+        [
+            (success("cat-1"), 1),  # a second success
+            (failure("cat-1"), 1),  # a failure of what had succeeded
+            (failure("bad-1"), 0),  # twice in one plan
+        ],
+        ids=["second success", "failure of a success", "same retry"],
+    )
+    def test_what_is_no_retry_is_found(
+        self, finished: DirectoryStore, engine_output: Path, tmp_path: Path, result: VideoResult, retry: int
+    ) -> None:
+        lease = dataclasses.replace(make_lease([result.key], ordinal=3), retry=retry)
+        commit_shard(lease, [result], engine_output, tmp_path / "s", finished, lambda: True)
+        with pytest.raises(IntegrityError, match=f"video {result.key} occurs twice"):
+            finalise(finished, JOB, SPEC, num_shards=4, num_videos=6)
+        assert any(f"video {result.key} occurs twice" in problem for problem in verify(finished).problems)
+
+    def test_a_data_set_from_before_there_were_retries_is_whole(self, finished: DirectoryStore) -> None:
+        described = json.loads(finished.get_bytes("dataset.json"))
+        del described["totals"]["superseded"]
+        finished.put_bytes("dataset.json", json.dumps(described).encode())
+        assert verify(finished).ok

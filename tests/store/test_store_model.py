@@ -19,7 +19,8 @@ from hypothesis.stateful import (
 from sqlalchemy import text
 from store_helpers import planned_job, record
 
-from services.domain.errors import JobNotCancellable
+from services.domain.control import RetrySelection
+from services.domain.errors import JobNotCancellable, JobNotPausable, JobNotResumable, JobNotRetryable
 from services.domain.models import Death, Lease, LeaseProgress
 from services.domain.states import JobState, ShardState, VideoStatus
 from services.store.database import Database
@@ -37,6 +38,9 @@ class ModelShard:
     run_out: bool = False
     deaths: dict[str, int] = field(default_factory=dict)
     result: VideoStatus | None = None
+    videos: int = 2
+    retry: int = 0
+    superseded: bool = False  # its videos failed and belong to a later shard now
 
 
 class LeaseProtocol(RuleBasedStateMachine):
@@ -54,6 +58,7 @@ class LeaseProtocol(RuleBasedStateMachine):
         self.job_id = planned_job(self.store, SHARDS, videos_each=2)
         self.shards = [ModelShard() for _ in range(SHARDS)]
         self.job = JobState.RUNNING
+        self.retries = 0
 
     def teardown(self) -> None:
         self.store.close()
@@ -63,7 +68,8 @@ class LeaseProtocol(RuleBasedStateMachine):
         return shard.state is ShardState.LEASED and shard.fence == lease.fence
 
     def end_lease(self, shard: ModelShard) -> None:
-        shard.state = ShardState.PENDING if self.job is JobState.RUNNING else ShardState.CANCELLED
+        goes_on = self.job in (JobState.RUNNING, JobState.PAUSED)
+        shard.state = ShardState.PENDING if goes_on else ShardState.CANCELLED
         shard.run_out = False
 
     def settle(self) -> None:
@@ -80,6 +86,7 @@ class LeaseProtocol(RuleBasedStateMachine):
             shard = self.shards[lease.ordinal]
             shard.state, shard.holder, shard.fence = ShardState.LEASED, holder, shard.fence + 1
             assert (lease.fence, lease.attempt, lease.holder) == (shard.fence, shard.fence, holder)
+            assert (lease.retry, len(lease.videos)) == (shard.retry, shard.videos)
             assert {key: len(deaths) for key, deaths in lease.spent.items()} == shard.deaths
         return multiple(*got)
 
@@ -91,7 +98,7 @@ class LeaseProtocol(RuleBasedStateMachine):
         if not self.current(lease) or shard.holder != holder:
             assert answer.verdict == "lost"
             return
-        assert answer.verdict == ("continue" if self.job is JobState.RUNNING else "cancel")
+        assert answer.verdict == {JobState.RUNNING: "continue", JobState.PAUSED: "pause"}.get(self.job, "cancel")
         shard.run_out = for_no_time
 
     @rule()
@@ -112,7 +119,8 @@ class LeaseProtocol(RuleBasedStateMachine):
     @rule(lease=leases, video=st.integers(0, 1))
     def blame(self, lease: Lease, video: int) -> None:
         key = lease.videos[video].key
-        deaths = self.shards[lease.ordinal].deaths
+        shard = self.shards[lease.ordinal]
+        deaths = {} if shard.superseded else shard.deaths
         if self.current(lease):
             deaths[key] = deaths.get(key, 0) + 1
         assert len(self.store.blame(lease.shard_id, lease.fence, key, Death("test"))) == deaths.get(key, 0)
@@ -133,8 +141,8 @@ class LeaseProtocol(RuleBasedStateMachine):
 
     @rule()
     def cancel(self) -> None:
-        if self.job in (JobState.RUNNING, JobState.CANCELLING):
-            if self.job is JobState.RUNNING:
+        if self.job in (JobState.RUNNING, JobState.PAUSED, JobState.CANCELLING):
+            if self.job is not JobState.CANCELLING:
                 self.job = JobState.CANCELLING
                 for shard in self.shards:
                     if shard.state is ShardState.PENDING:
@@ -146,12 +154,45 @@ class LeaseProtocol(RuleBasedStateMachine):
                 self.store.request_cancel(self.job_id)
 
     @rule()
+    def pause(self) -> None:
+        if self.job in (JobState.RUNNING, JobState.PAUSED):
+            self.job = JobState.PAUSED
+            assert self.store.request_pause(self.job_id).state is self.job
+        else:
+            with pytest.raises(JobNotPausable):
+                self.store.request_pause(self.job_id)
+
+    @rule()
+    def resume(self) -> None:
+        if self.job in (JobState.RUNNING, JobState.PAUSED):
+            self.job = JobState.RUNNING
+            assert self.store.resume(self.job_id).state is self.job
+        else:
+            with pytest.raises(JobNotResumable):
+                self.store.resume(self.job_id)
+
+    @rule()
+    def retry(self) -> None:
+        selection = RetrySelection(error_codes=("media_corrupt",))
+        if self.job is not JobState.SUCCEEDED_WITH_ERRORS:
+            with pytest.raises(JobNotRetryable):
+                self.store.retry(self.job_id, selection)
+            return
+        lost = [s for s in self.shards if s.result is VideoStatus.FAILED and not s.superseded]
+        for shard in lost:
+            shard.superseded = True
+        self.retries += 1
+        self.shards.append(ModelShard(videos=sum(s.videos for s in lost), retry=self.retries))
+        self.job = JobState.RUNNING
+        assert self.store.retry(self.job_id, selection).state is self.job
+
+    @rule()
     def finalise(self) -> None:
         job = self.store.next_finalizable()
         settled = all(s.state is ShardState.COMMITTED for s in self.shards)
         if self.job is JobState.RUNNING and settled:
             assert job is not None
-            failed = any(s.result is VideoStatus.FAILED for s in self.shards)
+            failed = any(s.result is VideoStatus.FAILED and not s.superseded for s in self.shards)
             self.job = JobState.SUCCEEDED_WITH_ERRORS if failed else JobState.SUCCEEDED
             assert self.store.finish_job(job.id).state is self.job
         else:
@@ -165,10 +206,12 @@ class LeaseProtocol(RuleBasedStateMachine):
         assert [(r.state, r.attempts) for r in rows] == [(s.state, s.fence) for s in self.shards]
         assert [r.holder for r in rows] == [s.holder if s.state is ShardState.LEASED else None for s in self.shards]
         committed = [s for s in self.shards if s.state is ShardState.COMMITTED]
-        failed = [s for s in committed if s.result is VideoStatus.FAILED]
+        failed = [s for s in committed if s.result is VideoStatus.FAILED and not s.superseded]
+        succeeded = [s for s in committed if s.result is VideoStatus.SUCCEEDED]
         assert job.progress.shards_committed == len(committed)
-        assert job.progress.videos_failed == 2 * len(failed)
-        assert job.progress.videos_succeeded == 2 * (len(committed) - len(failed))
+        assert job.progress.videos_failed == sum(s.videos for s in failed)
+        assert job.progress.videos_succeeded == sum(s.videos for s in succeeded)
+        assert job.retries == self.retries
 
 
 def test_the_store_is_the_model(store: SqlStore, store_url: str) -> None:
