@@ -242,7 +242,7 @@ class _Index:
                     self._failures.expect(row)
             for listed in (self._meta, self._failures, self._shards):
                 listed.end()
-        except IntegrityError as error:
+        except (IntegrityError, ObjectMissing) as error:
             report.problem(str(error))
         self._index.close()
         try:

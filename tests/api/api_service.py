@@ -22,9 +22,7 @@ class Service:
 
 
 @contextlib.contextmanager
-def running(
-    database_url: str, *settings: str, stderr: IO[str] | None = None, **environment: str
-) -> Iterator[Service]:
+def running(database_url: str, *settings: str, stderr: IO[str] | None = None, **environment: str) -> Iterator[Service]:
     process = subprocess.Popen(
         [sys.executable, str(Path(__file__).with_name("api_process.py")), database_url, *settings],
         stdout=subprocess.PIPE,

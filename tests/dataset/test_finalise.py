@@ -12,11 +12,11 @@ import pytest
 import yaml
 from shard_factory import ATTRIBUTES, JOB, commit_shard, failure, make_lease, success, write_artifacts
 
-from services.commit import committed_records
+from services.commit import committed_records, publish_plan
 from services.dataset import finalise, iterate, read_one, verify
 from services.dataset.schema import meta_schema, public_spec, public_uri
 from services.domain.errors import IntegrityError
-from services.domain.models import JobSpec, VideoResult
+from services.domain.models import JobSpec, PlannedShard, VideoResult
 from services.storage import DirectoryStore, ObjectStore
 
 SPEC = JobSpec(inputs=("/in",), output="/out", attributes=ATTRIBUTES, name='Three "animals"')
@@ -179,6 +179,8 @@ class TestRetries:
         write_artifacts(artifacts, "bad-1", 2, info=True)
         for ordinal, result in ((3, success("bad-1", 2)), (4, failure("poison-3"))):
             lease = dataclasses.replace(make_lease([result.key], ordinal=ordinal), retry=1)
+            planned = PlannedShard(ordinal, lease.plan_hash, (result.key,))
+            publish_plan(finished, JOB, SPEC.config_hash, lambda first, planned=planned: [planned], ordinal + 1)
             commit_shard(lease, [result], artifacts, tmp_path / "s", finished, lambda: True)
         return finished
 
@@ -198,10 +200,11 @@ class TestRetries:
         assert read_one(retried, "bad-1").num_frames == 2
         assert {sample.key for sample in iterate(retried)} == {"ant-2", "bad-1", "cat-1", "dog-3"}
 
-    def test_until_it_is_finalised_again_the_description_is_older_than_the_records(
-        self, retried: DirectoryStore
-    ) -> None:
-        assert not verify(retried).ok
+    def test_until_it_is_finalised_again_the_records_are_ahead_of_the_index(self, retried: DirectoryStore) -> None:
+        report = verify(retried)
+        assert report.ok, report.problems
+        assert not report.finished
+        assert (report.totals.videos, report.planned_videos, report.totals.superseded) == (6, 6, 2)
 
     @pytest.mark.parametrize(
         ("result", "retry"),
