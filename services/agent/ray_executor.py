@@ -157,7 +157,9 @@ class RaySlot:
                     break
             if time.monotonic() > deadline:
                 return Died("the process was not ready in time")
-        self._place = f"{host}/gpu-{','.join(gpus)}" if gpus else f"{host}/slot-{self._number}"
+        # Slots without a GPU of their own are told apart by the scratch folder, too: a host may have several agents.
+        slot = f"{host}:{self._config.scratch_dir}/slot-{self._number}"
+        self._place = f"{host}/gpu-{','.join(gpus)}" if gpus else slot
         with self._lock:
             self._progress, self._progress_call = SlotProgress(), None
         return None
