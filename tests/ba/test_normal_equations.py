@@ -9,6 +9,7 @@ import torch
 from ba_scenes import disturbed, float32, scene, with_depth_prior, with_noise
 
 from vipe_core.ba import Edges, Free, Options, Priors, Problem, State, Step, newton_step, oracle
+from vipe_core.ba.problem import RobustKernel
 from vipe_core.ba.torch_solver import TorchSolver
 from vipe_core.cameras import CameraModel
 
@@ -41,9 +42,9 @@ def torch_step(problem: Problem, state: State, options: Options, damping: float 
 @pytest.mark.parametrize("damping", [0.0, 1e-3, 10.0])
 @pytest.mark.parametrize("robust", ["none", "huber", "cauchy", "geman_mcclure", "tukey"])
 @pytest.mark.parametrize("camera_model", ["pinhole", "mei"])
-def test_step_equals_the_dense_oracle(camera_model: CameraModel, robust: str, damping: float) -> None:
+def test_step_equals_the_dense_oracle(camera_model: CameraModel, robust: RobustKernel, damping: float) -> None:
     problem, state = small_problem(camera_model, distortion_free=camera_model == "mei")
-    options = Options(robust=robust, robust_scale_px=0.3)  # type: ignore[arg-type]
+    options = Options(robust=robust, robust_scale_px=0.3)
     expected = oracle.newton_step(problem, state, options, damping)
     assert_same_step(newton_step(problem, state, options, damping), expected, 1e-10)
     assert_same_step(torch_step(problem, state, options, damping), expected, 1e-10)

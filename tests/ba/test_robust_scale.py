@@ -12,27 +12,28 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from vipe_core.ba import Options, Problem, State, largest_residual_px, residual_sigma_px, robust, robust_scale_px, solve
+from vipe_core.ba.problem import RobustKernel
 
 KERNELS = ["huber", "cauchy", "geman_mcclure", "tukey"]
 
 
 @settings(max_examples=80, deadline=None)
 @given(st.sampled_from(KERNELS), st.floats(0.1, 10.0), st.floats(1e-3, 300.0))
-def test_slope_is_the_derivative_of_the_cost(kernel: str, scale_px: float, squared: float) -> None:
+def test_slope_is_the_derivative_of_the_cost(kernel: RobustKernel, scale_px: float, squared: float) -> None:
     s = torch.tensor(squared, dtype=torch.float64, requires_grad=True)
-    robust.cost(kernel, scale_px, s).backward()  # type: ignore[arg-type, no-untyped-call]
-    root = robust.root_slope(kernel, scale_px, s.detach())  # type: ignore[arg-type]
+    robust.cost(kernel, scale_px, s).backward()  # type: ignore[no-untyped-call]
+    root = robust.root_slope(kernel, scale_px, s.detach())
     assert s.grad is not None
     assert root is not None
     assert float(root) ** 2 == pytest.approx(float(s.grad), rel=1e-9, abs=1e-12)
 
 
 @pytest.mark.parametrize("kernel", KERNELS)
-def test_kernels_are_quadratic_at_zero_and_never_fall(kernel: str) -> None:
+def test_kernels_are_quadratic_at_zero_and_never_fall(kernel: RobustKernel) -> None:
     squared = torch.linspace(0, 400, 2001, dtype=torch.float64)
-    cost = robust.cost(kernel, 3.0, squared)  # type: ignore[arg-type]
+    cost = robust.cost(kernel, 3.0, squared)
     assert (cost.diff() >= 0).all()
-    assert float(robust.cost(kernel, 3.0, torch.tensor(1e-6, dtype=torch.float64))) == pytest.approx(1e-6)  # type: ignore[arg-type]
+    assert float(robust.cost(kernel, 3.0, torch.tensor(1e-6, dtype=torch.float64))) == pytest.approx(1e-6)
 
 
 def with_outliers(problem: Problem, share: float, jump_px: float, seed: int = 4) -> Problem:
@@ -85,7 +86,7 @@ def test_largest_residual_is_found() -> None:
 
 @pytest.mark.parametrize("robust_kernel", ["geman_mcclure", "tukey"])
 @pytest.mark.parametrize("first_px", [math.inf, 40.0])
-def test_graduation_finds_the_answer_that_a_narrow_kernel_misses(robust_kernel: str, first_px: float) -> None:
+def test_graduation_finds_the_answer_that_a_narrow_kernel_misses(robust_kernel: RobustKernel, first_px: float) -> None:
     """Far off, a narrow redescending kernel believes nothing; a wide one brings the residuals into its range."""
     problem, truth = noisy(0.1)
     problem = with_outliers(problem, 0.2, 40.0)
@@ -96,7 +97,7 @@ def test_graduation_finds_the_answer_that_a_narrow_kernel_misses(robust_kernel: 
     held = start.cam_from_world.clone()
     held[1] = truth.cam_from_world[1]
     start = replace(start, cam_from_world=held)
-    options = Options(max_iterations=60, robust=robust_kernel, robust_scale_px=1.0, relative_tolerance=1e-6)  # type: ignore[arg-type]
+    options = Options(max_iterations=60, robust=robust_kernel, robust_scale_px=1.0, relative_tolerance=1e-6)
     narrow = solve(problem, start, options)
     graduated = solve(problem, start, replace(options, initial_scale_px=first_px))
     best = solve(problem, truth, options)

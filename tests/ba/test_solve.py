@@ -11,6 +11,7 @@ import torch
 from ba_scenes import disturbed, float32, scene, with_depth_prior, with_noise
 
 from vipe_core.ba import Edges, Free, Options, Problem, Result, State, Status, reproject, residuals, solve
+from vipe_core.ba.problem import RobustKernel
 from vipe_core.cameras import CameraModel
 from vipe_core.errors import ConfigError
 from vipe_core.geometry import se3, umeyama
@@ -27,10 +28,10 @@ def position_error(result: Result, truth: State) -> float:
 @pytest.mark.parametrize("sign", [-1, 1])
 @pytest.mark.parametrize("robust", ["none", "geman_mcclure"])
 @pytest.mark.parametrize("camera_model", ["pinhole", "mei"])
-def test_exact_measurements_give_the_exact_answer(camera_model: CameraModel, robust: str, sign: int) -> None:
+def test_exact_measurements_give_the_exact_answer(camera_model: CameraModel, robust: RobustKernel, sign: int) -> None:
     problem, truth = scene(camera_model, num_frames=8, height=8, width=10, distortion_free=camera_model == "mei")
     start = disturbed(truth, depth=0.2, log_focal=sign * math.log(1.16))
-    options = Options(max_iterations=40, robust=robust, robust_scale_px=10.0)  # type: ignore[arg-type]
+    options = Options(max_iterations=40, robust=robust, robust_scale_px=10.0)
     result = solve(problem, start, options)
     assert result.status is Status.CONVERGED
     assert result.cost < 1e-10 < result.initial_cost

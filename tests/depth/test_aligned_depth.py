@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import cv2
 import numpy as np
 import pytest
+from clip_source import ClipSource, scene_of
 
-from vipe_core.annotation import FILLED, MEASURED, SKY, UNOBSERVED
-from vipe_core.cameras import Camera
+from vipe_core.annotation import FILLED, MEASURED, SKY, UNOBSERVED, DepthKind
+from vipe_core.cameras import Camera, CameraModel
 from vipe_core.depth.aligned import AlignedDepth
 from vipe_core.depth.alignment import AlignmentSettings
 from vipe_core.depth.projection import MapProjector
@@ -27,49 +28,9 @@ from vipe_core.evaluation.synthetic.depth_models import (
 from vipe_core.priors.protocols import DepthFamily
 from vipe_core.slam.segmentation import MOVING as MOVING_CELL
 from vipe_core.slam.segmentation import STATIC as STATIC_CELL
-from vipe_core.video.source import Frame, FrameStream, VideoInfo
 
 SIZE = (160, 120)
 EXACT = Distortion(0, 0, 0, 0, 0, 0)
-
-
-@dataclass
-class ClipSource:
-    """A `FrameSource` over rendered frames that counts what is open and how far ahead it was read."""
-
-    rgb: np.ndarray
-    masked: np.ndarray | None = None
-    open: int = 0
-    decoded: int = 0
-
-    @property
-    def info(self) -> VideoInfo:
-        n, h, w = self.rgb.shape[:3]
-        return VideoInfo("clip", "clip", w, h, 24.0, n, n / 24, 0, "none", "rgb24", 0)
-
-    def frames(self, size: tuple[int, int] | None = None, start: int = 0, stop: int | None = None) -> FrameStream:
-        self.open += 1
-        try:
-            for index, rgb in list(enumerate(self.rgb))[start:stop]:
-                self.decoded += size is not None
-                picture = rgb if size is None else cv2.resize(rgb, size, interpolation=cv2.INTER_AREA)
-                masked = None if self.masked is None else self.masked[index]
-                if masked is not None and size is not None:
-                    masked = cv2.resize(masked.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
-                yield Frame(index, index / 24, picture, masked)
-        finally:
-            self.open -= 1
-
-
-def scene_of(clip: SyntheticClip, every: int = 4, noise: float = 0.02) -> SceneMap:
-    """The map that a bundle adjustment would leave: noisy inverse depth at the cells, nothing at edges."""
-    n, height, width = clip.depth.shape
-    keyframes = np.arange(0, n, every)
-    blocks = (1 / clip.depth[keyframes]).reshape(len(keyframes), height // 8, 8, width // 8, 8)
-    value, spread = blocks.mean((2, 4)), blocks.max((2, 4)) / blocks.min((2, 4))
-    value = value * np.exp(noise * np.random.default_rng(3).standard_normal(value.shape))
-    sure = np.where(spread < 1.2, 0.8, 0.0)
-    return SceneMap(clip.camera, clip.world_from_cam, keyframes, value.astype(np.float32), sure.astype(np.float32))
 
 
 def video_of(clip: SyntheticClip, distortion: Distortion, **changes: int) -> DistortedVideoDepth:
@@ -162,10 +123,10 @@ def test_the_sky_is_at_the_far_end(clip: SyntheticClip, scene: SceneMap) -> None
 
 
 @pytest.mark.parametrize(("model", "kind"), [("mei", "z"), ("mei", "ray"), ("equirect", "ray")])
-def test_every_camera_and_kind_of_depth(model: str, kind: str) -> None:
+def test_every_camera_and_kind_of_depth(model: CameraModel, kind: DepthKind) -> None:
     size = (192, 144) if model == "mei" else (256, 128)
-    clip = tiny_clip("sideways", 10, *size, model=model, noise=1.0)  # type: ignore[arg-type]
-    along = inverse_along(clip.camera, kind)  # type: ignore[arg-type]
+    clip = tiny_clip("sideways", 10, *size, model=model, noise=1.0)
+    along = inverse_along(clip.camera, kind)
     depth = np.where(along > 0, clip.depth / np.where(along > 0, along, 1), 0)
     video = DistortedVideoDepth(
         ClipSource(clip.rgb),
@@ -174,7 +135,7 @@ def test_every_camera_and_kind_of_depth(model: str, kind: str) -> None:
         size,
         Distortion(),
         window_frames=6,
-        overlap_frames=2,  # type: ignore[arg-type]
+        overlap_frames=2,
     )
     frames = run(clip, scene_of(clip), DepthFamily(video=video))
     assert np.median(errors(frames, clip)) < 0.04
@@ -266,7 +227,7 @@ class Broken:
 
 def test_a_model_that_breaks_its_protocol_is_an_engine_error(clip: SyntheticClip, scene: SceneMap) -> None:
     with pytest.raises(EngineError, match=r"\(4, 120, 160\)"):
-        run(clip, scene, DepthFamily(video=Broken()))  # type: ignore[arg-type]
+        run(clip, scene, DepthFamily(video=Broken()))
     with pytest.raises(EngineError, match="overlap by 9"):
         run(clip, scene, DepthFamily(video=video_of(clip, EXACT, window_frames=9, overlap_frames=9)))
     with pytest.raises(ConfigError, match="video depth"):

@@ -8,54 +8,18 @@ from collections.abc import Callable
 import cv2
 import numpy as np
 import pytest
+from clip_source import ClipSource, scene_of
 
-from vipe_core.cameras import Camera
+from vipe_core.cameras import Camera, CameraModel
 from vipe_core.depth.stream import DenseDepth
 from vipe_core.depth.types import FILLED, MEASURED, MOVING, DepthFrame, DepthSettings, SceneMap
 from vipe_core.errors import EngineError
 from vipe_core.evaluation.synthetic import SyntheticClip, tiny_clip
+from vipe_core.evaluation.synthetic.clip import ClipKind
 from vipe_core.slam.segmentation import MOVING as SOMETHING_MOVES
 from vipe_core.slam.segmentation import STATIC
-from vipe_core.video.source import Frame, FrameStream, VideoInfo
 
 SETTINGS = DepthSettings(window_frames=20)
-
-
-class ClipSource:
-    """A `FrameSource` over rendered frames that remembers how far each stream has been read."""
-
-    def __init__(self, rgb: np.ndarray) -> None:
-        self.rgb = rgb
-        self.open = 0
-        self.decoded = 0
-
-    @property
-    def info(self) -> VideoInfo:
-        n, h, w = self.rgb.shape[:3]
-        return VideoInfo("clip", "clip", w, h, 24.0, n, n / 24, 0, "none", "rgb24", 0)
-
-    def frames(self, size: tuple[int, int] | None = None, start: int = 0, stop: int | None = None) -> FrameStream:
-        self.open += 1
-        try:
-            for index, rgb in list(enumerate(self.rgb))[start:stop]:
-                self.decoded += size is not None
-                picture = rgb if size is None else cv2.resize(rgb, size, interpolation=cv2.INTER_AREA)
-                yield Frame(index, index / 24, picture)
-        finally:
-            self.open -= 1
-
-
-def scene_of(clip: SyntheticClip, every: int = 4, noise: float = 0.03, confidence: float = 0.8) -> SceneMap:
-    """The map that a bundle adjustment would leave: noisy inverse depth at the cells, unsure near borders."""
-    n, height, width = clip.depth.shape
-    keyframes = np.arange(0, n, every)
-    inverse = 1 / clip.depth[keyframes]
-    blocks = inverse[:, : height // 8 * 8, : width // 8 * 8].reshape(len(keyframes), height // 8, 8, width // 8, 8)
-    value, spread = blocks.mean((2, 4)), blocks.max((2, 4)) / blocks.min((2, 4))
-    rng = np.random.default_rng(3)
-    value = value * np.exp(noise * rng.standard_normal(value.shape))
-    sure = np.where(spread < 1.2, confidence, 0.0)
-    return SceneMap(clip.camera, clip.world_from_cam, keyframes, value.astype(np.float32), sure.astype(np.float32))
 
 
 def run(clip: SyntheticClip, scene: SceneMap) -> list[DepthFrame]:
@@ -84,7 +48,7 @@ def sideways() -> SyntheticClip:
 
 @pytest.fixture(scope="module")
 def depth_of_sideways(sideways: SyntheticClip) -> list[DepthFrame]:
-    return run(sideways, scene_of(sideways))
+    return run(sideways, scene_of(sideways, noise=0.03))
 
 
 def test_depth_is_accurate_and_dense(sideways: SyntheticClip, depth_of_sideways: list[DepthFrame]) -> None:
@@ -111,7 +75,7 @@ def test_depth_does_not_need_good_keyframe_maps(sideways: SyntheticClip) -> None
 
 def test_the_fast_setting_is_nearly_as_good(sideways: SyntheticClip) -> None:
     settings = dataclasses.replace(DepthSettings.fast(), window_frames=20)
-    stream = DenseDepth(settings).stream(ClipSource(sideways.rgb), scene_of(sideways))
+    stream = DenseDepth(settings).stream(ClipSource(sideways.rgb), scene_of(sideways, noise=0.03))
     errors = np.stack([relative_error(frame, sideways) for frame in stream])
     assert errors.mean() < 0.05
     assert np.median(errors) < 0.015
@@ -119,15 +83,15 @@ def test_the_fast_setting_is_nearly_as_good(sideways: SyntheticClip) -> None:
 
 def test_forward_motion() -> None:
     clip = tiny_clip("forward", num_frames=14)
-    errors = np.stack([relative_error(f, clip) for f in run(clip, scene_of(clip))])
+    errors = np.stack([relative_error(f, clip) for f in run(clip, scene_of(clip, noise=0.03))])
     assert np.median(errors) < 0.02
     assert errors.mean() < 0.06
 
 
 @pytest.mark.parametrize("kind", ["static", "pure_rotation"])
-def test_without_parallax_the_keyframes_are_carried_and_nothing_is_sure(kind: str) -> None:
-    clip = tiny_clip(kind, num_frames=5)  # type: ignore[arg-type]
-    frames = run(clip, scene_of(clip))
+def test_without_parallax_the_keyframes_are_carried_and_nothing_is_sure(kind: ClipKind) -> None:
+    clip = tiny_clip(kind, num_frames=5)
+    frames = run(clip, scene_of(clip, noise=0.03))
     assert_sound(frames, clip)
     errors = np.stack([relative_error(f, clip) for f in frames])
     assert np.median(errors) < 0.06
@@ -148,7 +112,7 @@ def test_single_frame_without_any_map_is_a_plane(sideways: SyntheticClip) -> Non
 
 def test_output_has_the_size_of_the_source(sideways: SyntheticClip, depth_of_sideways: list[DepthFrame]) -> None:
     large = np.stack([cv2.resize(f, (501, 377), interpolation=cv2.INTER_CUBIC) for f in sideways.rgb[:6]])
-    scene = scene_of(sideways)
+    scene = scene_of(sideways, noise=0.03)
     scene = SceneMap(
         scene.camera, scene.world_from_cam[:6], scene.keyframes[:2], scene.inverse_depth[:2], scene.confidence[:2]
     )
@@ -159,16 +123,16 @@ def test_output_has_the_size_of_the_source(sideways: SyntheticClip, depth_of_sid
 
 
 @pytest.mark.parametrize("model", ["mei", "equirect"])
-def test_other_cameras_give_ray_distance(model: str) -> None:
+def test_other_cameras_give_ray_distance(model: CameraModel) -> None:
     size = (256, 192) if model == "mei" else (320, 160)
-    clip = tiny_clip("sideways", 12, *size, model=model)  # type: ignore[arg-type]
-    errors = np.stack([relative_error(f, clip) for f in run(clip, scene_of(clip))])
+    clip = tiny_clip("sideways", 12, *size, model=model)
+    errors = np.stack([relative_error(f, clip) for f in run(clip, scene_of(clip, noise=0.03))])
     assert np.median(errors) < 0.03
 
 
 def test_closing_early_closes_the_decoders(sideways: SyntheticClip) -> None:
     source = ClipSource(sideways.rgb)
-    stream = DenseDepth(SETTINGS).stream(source, scene_of(sideways))
+    stream = DenseDepth(SETTINGS).stream(source, scene_of(sideways, noise=0.03))
     assert next(stream).index == 0
     assert source.open == 2
     stream.close()
@@ -178,13 +142,13 @@ def test_closing_early_closes_the_decoders(sideways: SyntheticClip) -> None:
 def test_the_decoder_ahead_stays_within_the_window(sideways: SyntheticClip) -> None:
     settings = DepthSettings(window_frames=3, check_frames=(2,))
     source = ClipSource(sideways.rgb)
-    for frame in DenseDepth(settings).stream(source, scene_of(sideways)):
+    for frame in DenseDepth(settings).stream(source, scene_of(sideways, noise=0.03)):
         assert source.decoded <= frame.index + 3 + 2 + 1
 
 
 def test_a_video_that_ends_early_is_an_engine_error(sideways: SyntheticClip) -> None:
     with pytest.raises(EngineError, match="9 frames"):
-        list(DenseDepth(SETTINGS).stream(ClipSource(sideways.rgb[:9]), scene_of(sideways)))
+        list(DenseDepth(SETTINGS).stream(ClipSource(sideways.rgb[:9]), scene_of(sideways, noise=0.03)))
 
 
 def test_maps_must_fit_the_camera() -> None:
@@ -203,7 +167,7 @@ def test_same_input_same_bytes_whatever_the_threads(
     before_threads = cv2.getNumThreads()
     cv2.setNumThreads(threads)
     try:
-        again = DenseDepth(SETTINGS).stream(ClipSource(sideways.rgb), scene_of(sideways))
+        again = DenseDepth(SETTINGS).stream(ClipSource(sideways.rgb), scene_of(sideways, noise=0.03))
         for frame, before in zip(again, depth_of_sideways[:3], strict=False):
             assert frame.depth.tobytes() == before.depth.tobytes()
             assert frame.confidence.tobytes() == before.confidence.tobytes()
@@ -225,7 +189,7 @@ def test_every_pixel_says_where_its_depth_comes_from(
 def test_what_moves_is_marked_and_a_mask_over_what_is_static_is_not(sideways: SyntheticClip) -> None:
     labels = np.full((len(sideways.rgb), 30 * 40), STATIC, np.int8)
     labels.reshape(-1, 30, 40)[:, 10:18, 12:22] = SOMETHING_MOVES
-    scene = dataclasses.replace(scene_of(sideways), labels=labels)
+    scene = dataclasses.replace(scene_of(sideways, noise=0.03), labels=labels)
     changing = sideways.rgb.copy()
     noise = np.random.default_rng(0).integers(0, 255, (len(changing), 16, 20, 3), np.uint8)
     for picture, blocks in zip(changing, noise, strict=True):

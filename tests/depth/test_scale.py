@@ -7,10 +7,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from clip_source import scene_of
 from hypothesis import given
 from hypothesis import strategies as st
 
-from vipe_core.cameras import Camera
+from vipe_core.annotation import DepthKind
+from vipe_core.cameras import Camera, CameraModel
 from vipe_core.depth.ground import scale_from_height
 from vipe_core.depth.known import KnownLength
 from vipe_core.depth.projection import MapProjector
@@ -33,19 +35,6 @@ from vipe_core.geometry.arrays import inverse
 from vipe_core.priors.protocols import MetricEstimate
 
 
-def scene_of(clip: SyntheticClip, every: int = 3, noise: float = 0.01, unit: float = 1.0) -> SceneMap:
-    """The map that bundle adjustment would leave: noisy inverse depth at the cells, in units of `unit` metres."""
-    n, height, width = clip.depth.shape
-    keyframes = np.arange(0, n, every)
-    blocks = (1 / clip.depth[keyframes]).reshape(len(keyframes), height // 8, 8, width // 8, 8)
-    sure = np.where(blocks.max((2, 4)) / blocks.min((2, 4)) < 1.2, 0.8, 0.0)
-    rng = np.random.default_rng(3)
-    value = blocks.mean((2, 4)) * np.exp(noise * rng.standard_normal(sure.shape)) * unit
-    poses = inverse(clip.world_from_cam[:1]) @ clip.world_from_cam
-    poses[:, :3, 3] /= unit
-    return SceneMap(clip.camera, poses, keyframes, value.astype(np.float32), sure.astype(np.float32))
-
-
 @pytest.fixture(scope="module")
 def sideways() -> SyntheticClip:
     return tiny_clip("sideways", num_frames=18)
@@ -54,7 +43,7 @@ def sideways() -> SyntheticClip:
 @pytest.fixture(scope="module")
 def scene(sideways: SyntheticClip) -> SceneMap:
     """One unit is 2.5 metres."""
-    return scene_of(sideways, unit=2.5)
+    return scene_of(sideways, every=3, noise=0.01, unit_m=2.5)
 
 
 @given(st.lists(st.floats(-5, 5), min_size=1, max_size=9), st.data())
@@ -152,7 +141,7 @@ def test_a_camera_at_rest_has_no_path(scene: SceneMap) -> None:
 
 def test_a_known_height(sideways: SyntheticClip) -> None:
     clip = tiny_clip("forward", num_frames=18)
-    scene = scene_of(clip, unit=0.4)
+    scene = scene_of(clip, every=3, noise=0.01, unit_m=0.4)
     height_m = float(np.median(clip.world_from_cam[:, 2, 3]))
     found = scale_from_height(scene, (0, 18), height_m)
     assert found.metres_per_unit == pytest.approx(0.4, rel=0.05)
@@ -217,18 +206,18 @@ def test_many_noisy_frames_and_some_wrong_ones_give_the_scale_within_its_interva
 
 @pytest.mark.parametrize("model", ["pinhole", "mei"])
 @pytest.mark.parametrize("kind", ["z", "ray"])
-def test_metric_depth_of_either_kind_gives_the_scale(model: str, kind: str) -> None:
-    clip = tiny_clip("sideways", 6, 256, 192, model=model)  # type: ignore[arg-type]
-    scene = scene_of(clip, every=2, unit=4.0)
-    along = inverse_along(clip.camera, kind)  # type: ignore[arg-type]
+def test_metric_depth_of_either_kind_gives_the_scale(model: CameraModel, kind: DepthKind) -> None:
+    clip = tiny_clip("sideways", 6, 256, 192, model=model)
+    scene = scene_of(clip, every=2, noise=0.01, unit_m=4.0)
+    along = inverse_along(clip.camera, kind)
     depth_m = np.where(along > 0, clip.depth[2] / np.where(along > 0, along, 1), 0).astype(np.float32)
     prior = MetricEstimate(depth_m, np.ones_like(depth_m))
-    found = ratio_to_prior(scene, 1, scene.confidence[1] > 0.3, prior, kind)  # type: ignore[arg-type]
+    found = ratio_to_prior(scene, 1, scene.confidence[1] > 0.3, prior, kind)
     assert found is not None
     assert math.exp(found.log_ratio) == pytest.approx(4.0, rel=0.01)
     assert found.sigma < 0.05
     nothing = MetricEstimate(np.zeros_like(depth_m), np.ones_like(depth_m))
-    assert ratio_to_prior(scene, 1, scene.confidence[1] > 0.3, nothing, kind) is None  # type: ignore[arg-type]
+    assert ratio_to_prior(scene, 1, scene.confidence[1] > 0.3, nothing, kind) is None
 
 
 def test_z_is_shorter_than_the_ray_off_the_axis() -> None:

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
-from typing import Any
 
 import numpy as np
 import pytest
+from clip_source import ClipSource
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
@@ -22,8 +21,7 @@ from vipe_core.evaluation.consistency import (
     shuttle_errors,
 )
 from vipe_core.evaluation.matching import SiftMatcher, point_matcher
-from vipe_core.evaluation.synthetic import SyntheticClip, tiny_clip
-from vipe_core.video.source import Frame, VideoInfo
+from vipe_core.evaluation.synthetic import tiny_clip
 
 CAMERA = Camera("pinhole", (300.0, 310.0, 160.0, 120.0), 320, 240)
 
@@ -99,23 +97,9 @@ def test_a_wide_angle_camera_has_no_fundamental_matrix() -> None:
         fundamental_matrix(np.eye(4), Camera("mei", (100.0, 100.0, 160.0, 120.0, 0.5), 320, 240))
 
 
-class ClipSource:
-    def __init__(self, clip: SyntheticClip) -> None:
-        self._clip = clip
-
-    @property
-    def info(self) -> VideoInfo:
-        camera = self._clip.camera
-        return VideoInfo("clip", "", camera.width, camera.height, 30.0, None, None, 0, "raw", "rgb24", 0)
-
-    def frames(self, size: Any = None, start: int = 0, stop: int | None = None) -> Iterator[Frame]:
-        for k, rgb in enumerate(self._clip.rgb[start:stop]):
-            yield Frame(k, k / 30, rgb)
-
-
 def test_sampson_error_tells_true_poses_from_wrong_ones() -> None:
     clip = tiny_clip("orbit", 4, 320, 240)
-    source, matcher = ClipSource(clip), SiftMatcher()
+    source, matcher = ClipSource(clip.rgb), SiftMatcher()
     true = sampson_errors(source, clip.world_from_cam, clip.camera, matcher)
     assert true is not None
     assert (true.pairs, true.matcher) == (3, "SIFT")
@@ -132,7 +116,9 @@ def test_sampson_error_tells_true_poses_from_wrong_ones() -> None:
 
 def test_sampson_error_of_a_camera_that_stands_still() -> None:
     clip = tiny_clip("orbit", 3, 160, 120)
-    assert sampson_errors(ClipSource(clip), np.repeat(np.eye(4)[None], 3, axis=0), clip.camera, SiftMatcher()) is None
+    assert (
+        sampson_errors(ClipSource(clip.rgb), np.repeat(np.eye(4)[None], 3, axis=0), clip.camera, SiftMatcher()) is None
+    )
 
 
 def test_sift_finds_nothing_in_a_blank_picture() -> None:

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from exact_room import POSES, ROOM, distance_to_surfaces, view
 
-from vipe_core.cameras import Camera
+from vipe_core.annotation import DepthKind
+from vipe_core.cameras import Camera, CameraModel
 from vipe_core.fusion import CloudFuser, SurfaceView, surface_weight
 
 PINHOLE = Camera.pinhole_from_fov(70.0, 160, 120)
@@ -18,11 +19,11 @@ CAMERAS = {
 
 
 @pytest.mark.parametrize(("model", "kind"), [("pinhole", "z"), ("mei", "z"), ("mei", "ray"), ("equirect", "ray")])
-def test_points_of_exact_depth_lie_on_the_surfaces(model: str, kind: str) -> None:
+def test_points_of_exact_depth_lie_on_the_surfaces(model: CameraModel, kind: DepthKind) -> None:
     camera = CAMERAS[model]
-    fuser = CloudFuser(camera, kind, 0.03)  # type: ignore[arg-type]
+    fuser = CloudFuser(camera, kind, 0.03)
     for pose in POSES:
-        fuser.add(view(camera, pose, kind))  # type: ignore[arg-type]
+        fuser.add(view(camera, pose, kind))
     cloud = fuser.cloud(min_frames=2)
     assert len(cloud) > 5000
     away = distance_to_surfaces(cloud.points.astype(np.float64))

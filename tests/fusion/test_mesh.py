@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from exact_room import BOX, BOX_CENTRE, POSES, distance_to_surfaces, pose, view
 
+from vipe_core.annotation import DepthKind
 from vipe_core.cameras import Camera
 from vipe_core.fusion import Mesh, TsdfVolume
 
@@ -73,10 +74,10 @@ def test_memory_is_bounded_by_larger_voxels() -> None:
     ("camera", "kind"),
     [(Camera("mei", (140.0, 140.0, 120.0, 90.0, 0.7), 240, 180), "z"), (Camera("equirect", (), 360, 180), "ray")],
 )
-def test_other_cameras(camera: Camera, kind: str) -> None:
-    volume = TsdfVolume(camera, kind, 0.06)  # type: ignore[arg-type]
+def test_other_cameras(camera: Camera, kind: DepthKind) -> None:
+    volume = TsdfVolume(camera, kind, 0.06)
     for one in (pose(-0.9, -0.5, -1.5), pose(-0.6, -0.4, -1.5), pose(-0.3, -0.5, -1.4)):
-        volume.add(view(camera, one, kind))  # type: ignore[arg-type]
+        volume.add(view(camera, one, kind))
     found = volume.mesh()
     away = distance_to_surfaces(found.vertices.astype(np.float64))
     assert len(away) > 3000

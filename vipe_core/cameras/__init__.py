@@ -1,5 +1,5 @@
 """Camera models: one value type, and the projection functions of each model (`projection`)."""
 
-from vipe_core.cameras.camera import Camera, CameraModel
+from vipe_core.cameras.camera import MODEL_CODE, Camera, CameraModel
 
-__all__ = ["Camera", "CameraModel"]
+__all__ = ["MODEL_CODE", "Camera", "CameraModel"]

@@ -22,6 +22,9 @@ if TYPE_CHECKING:
 
 CameraModel = Literal["pinhole", "mei", "equirect"]
 
+# How compiled code tells the models apart.
+MODEL_CODE: dict[CameraModel, int] = {"pinhole": 0, "mei": 1, "equirect": 2}
+
 _NUM_PARAMS: dict[str, int] = {"pinhole": 4, "mei": 5, "equirect": 0}
 
 

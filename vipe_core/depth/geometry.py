@@ -9,8 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from vipe_core.cameras import Camera
-from vipe_core.depth.kernels import MODEL_CODE
+from vipe_core.cameras import MODEL_CODE, Camera
 from vipe_core.depth.types import DepthSettings, SceneMap
 
 Array = NDArray[Any]

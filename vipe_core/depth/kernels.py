@@ -18,7 +18,6 @@ from vipe_core.compilation import compiled, vectorised
 
 Array = NDArray[Any]
 
-MODEL_CODE = {"pinhole": 0, "mei": 1, "equirect": 2}
 
 _FAR_COST = 1.0
 

@@ -65,7 +65,7 @@ class ConfidenceZipWriter(FrameZipWriter):
 
 
 class ConfidenceZipReader(FrameZipReader[np.float32]):
-    """Reads (H, W) float32 confidence in 0..1; 0 is a value that was filled in."""
+    """Reads (H, W) float32 confidence in 0..1; what was filled in has 0.05 at most."""
 
     suffix = "png"
     kind = "confidence map"

@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vipe_core.annotation import DepthKind
-from vipe_core.cameras import Camera
-from vipe_core.fusion.kernels import MODEL_CODE, add_points, coarsen_points, seen_through, surface_normals
+from vipe_core.cameras import MODEL_CODE, Camera
+from vipe_core.fusion.kernels import add_points, coarsen_points, seen_through, surface_normals
 from vipe_core.fusion.views import SurfaceView, points_per_depth
 from vipe_core.geometry.arrays import inverse
 
@@ -87,7 +87,7 @@ class CloudFuser:
         Raises:
             ValueError: The frame is not of the camera's size.
         """
-        depth, weight = _checked(view, self._rays)
+        depth, weight = view.planes(self._rays)
         normals, cosine = surface_normals(depth, weight, self._rays)
         first = 0
         while True:
@@ -138,7 +138,7 @@ class CloudFuser:
 
         Such a point is not there, or was not there then: a thing that moved, or a wrong depth.
         """
-        depth, weight = _checked(view, self._rays)
+        depth, weight = view.planes(self._rays)
         seen_through(
             cloud.points,
             depth,
@@ -150,10 +150,3 @@ class CloudFuser:
             _THROUGH,
             against,
         )
-
-
-def _checked(view: SurfaceView, rays: Array) -> tuple[Array, Array]:
-    size = rays.shape[:2]
-    if view.depth.shape != size or view.weight.shape != size or view.rgb.shape != (*size, 3):
-        raise ValueError(f"a view must be of the camera's size {size}, got {view.depth.shape} and {view.rgb.shape}")
-    return np.ascontiguousarray(view.depth, np.float32), np.ascontiguousarray(view.weight, np.float32)

@@ -18,7 +18,6 @@ from vipe_core.compilation import compiled
 Array = NDArray[Any]
 
 BLOCK = 8
-MODEL_CODE = {"pinhole": 0, "mei": 1, "equirect": 2}
 
 
 @compiled

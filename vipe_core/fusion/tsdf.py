@@ -14,11 +14,10 @@ from scipy import sparse
 from scipy.sparse import csgraph
 
 from vipe_core.annotation import DepthKind
-from vipe_core.cameras import Camera
+from vipe_core.cameras import MODEL_CODE, Camera
 from vipe_core.fusion.cloud import MIN_COSINE
 from vipe_core.fusion.kernels import (
     BLOCK,
-    MODEL_CODE,
     block_neighbours,
     coarsen_blocks,
     integrate,
@@ -93,11 +92,7 @@ class TsdfVolume:
         Raises:
             ValueError: The frame is not of the camera's size.
         """
-        size = self._rays.shape[:2]
-        if view.depth.shape != size or view.weight.shape != size or view.rgb.shape != (*size, 3):
-            raise ValueError(f"a view must be of the camera's size {size}, got {view.depth.shape} and {view.rgb.shape}")
-        depth = np.ascontiguousarray(view.depth, np.float32)
-        weight = np.ascontiguousarray(view.weight, np.float32)
+        depth, weight = view.planes(self._rays)
         world_from_cam = np.ascontiguousarray(view.world_from_cam, np.float64)
         _, cosine = surface_normals(depth, weight, self._rays)
         while True:

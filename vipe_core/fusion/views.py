@@ -30,6 +30,20 @@ class SurfaceView:
     depth: NDArray[np.float32]
     weight: NDArray[np.float32]
 
+    def planes(self, rays: Array) -> tuple[Array, Array]:
+        """Depth and weight as compiled code takes them.
+
+        Args:
+            rays: (H, W, 3) of the camera.
+
+        Raises:
+            ValueError: The view is not of the camera's size.
+        """
+        size = rays.shape[:2]
+        if self.depth.shape != size or self.weight.shape != size or self.rgb.shape != (*size, 3):
+            raise ValueError(f"a view must be of the camera's size {size}, got {self.depth.shape} and {self.rgb.shape}")
+        return np.ascontiguousarray(self.depth, np.float32), np.ascontiguousarray(self.weight, np.float32)
+
 
 def surface_weight(
     depth: Array,
@@ -40,8 +54,8 @@ def surface_weight(
 ) -> NDArray[np.float32]:
     """(H, W) float32 weight of each pixel: its confidence, or 1 where there is none, and 0 where it must stay out.
 
-    What moves by itself stays out, because it is not where another frame saw it. So does a value that nobody measured
-    (confidence 0).
+    What moves by itself stays out, because it is not where another frame saw it. So does a value without any
+    confidence.
 
     Args:
         depth: (H, W); not finite or not positive is no value.
