@@ -100,7 +100,7 @@ def measure(kind: str, num_keyframes: int, loops: bool, repeats: int) -> dict[st
         "peak_bytes": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024,
     }
     system = solver.linearise(state, scale_px)
-    result["reduced_s"] = cpu_seconds(lambda: solver.log_focal_variance(system, 1e-4), repeats)
+    result["reduced_s"] = cpu_seconds(lambda: solver.intrinsics_covariance(system, 1e-4), repeats)
     return result
 
 

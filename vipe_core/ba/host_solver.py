@@ -91,8 +91,8 @@ class HostSolver:
         touched[edges.source] = True
         touched[edges.target] = True
         self._nodes = torch.nonzero(free.poses.cpu() & touched)[:, 0].numpy()
-        self._free = np.array((free.focal, free.distortion and problem.camera_model == "mei"))
-        self.focal_free = free.focal
+        self.intrinsics_free = (free.focal, free.distortion and problem.camera_model == "mei")
+        self._free = np.array(self.intrinsics_free)
         self.anything_free = bool(len(self._nodes) or self._free.any() or depth_free.any())
         self._structure = self._analyse()
         self._place = np.full(num_frames, -1, np.int64)
@@ -188,7 +188,7 @@ class HostSolver:
     def _cost(self, sums: Array, state: State) -> Cost:
         measurements, weight, everything, prior = sums.sum(axis=0).tolist()
         priors = self.problem.priors
-        if priors.log_focal is not None and self.focal_free:
+        if priors.log_focal is not None and self.intrinsics_free[0]:
             prior += ((np.log(float(state.intrinsics[0])) - priors.log_focal) / priors.log_focal_sigma) ** 2
         return Cost(*torch.tensor([measurements, weight, everything - weight, prior], dtype=torch.float64))
 
@@ -252,7 +252,7 @@ class HostSolver:
         add(singly, kernels.ROWS**2 * singly, per_edge, direct, direct_gradient)
         add(graph.first, self._offset, per_frame, eliminated, eliminated_gradient)
         priors = self.problem.priors
-        if priors.log_focal is not None and self.focal_free:
+        if priors.log_focal is not None and self.intrinsics_free[0]:
             information = 1 / priors.log_focal_sigma**2
             direct[-1, 0, 0] += information
             direct_gradient[-1, 0] += information * (priors.log_focal - np.log(float(state.intrinsics[0])))
@@ -287,7 +287,7 @@ class HostSolver:
         else:
             solution[:] = np.nan
         log_focal = alpha = 0.0
-        if self.focal_free:
+        if self.intrinsics_free[0]:
             log_focal = float(np.clip(solution[-1, 0], -MAX_LOG_FOCAL_STEP, MAX_LOG_FOCAL_STEP))
             solution[-1, 0] = log_focal
         if self._free[1]:
@@ -342,16 +342,20 @@ class HostSolver:
         inverse_depth[held] = state.inverse_depth[held]
         return State(se3.exp(step.pose) @ state.cam_from_world, inverse_depth, intrinsics)
 
-    def log_focal_variance(self, system: HostSystem, damping: float) -> Tensor:
-        """Variance of log f with everything else marginalised; NaN where the damped system is singular. 0-dim."""
+    def intrinsics_covariance(self, system: HostSystem, damping: float) -> Tensor:
+        """See `Solver.intrinsics_covariance`."""
         scale, factor, factorised = self._factorise(system, damping)
-        variance = np.nan
-        if factorised and scale[-1, 0] > 0:
+        free = np.flatnonzero(self._free)
+        covariance = np.zeros((2, 2))
+        if not factorised or not (scale[-1, free] > 0).all():
+            covariance[np.ix_(free, free)] = np.nan
+            return torch.from_numpy(covariance)
+        for column in free:
             unit = np.zeros_like(scale)
-            unit[-1, 0] = scale[-1, 0]
+            unit[-1, column] = scale[-1, column]
             block_cholesky.substitute(self._structure.first, self._structure.rows, factor, unit)
-            variance = float(scale[-1, 0] * unit[-1, 0])
-        return torch.tensor(variance, dtype=torch.float64)
+            covariance[free, column] = (scale[-1] * unit[-1])[free]
+        return torch.from_numpy(covariance)
 
 
 def _flat(measurements: Tensor, dtype: torch.dtype) -> Array:

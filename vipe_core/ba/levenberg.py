@@ -16,7 +16,7 @@ from torch import Tensor
 
 from vipe_core.ba import robust
 from vipe_core.ba.host_solver import HostSolver
-from vipe_core.ba.problem import Edges, Options, Problem, Result, State, Status
+from vipe_core.ba.problem import Covariance, Edges, Options, Problem, Result, State, Status
 from vipe_core.ba.reprojection import require_supported
 from vipe_core.ba.scale import largest_residual_px
 from vipe_core.ba.solver import Cost, Solver, Step
@@ -77,13 +77,21 @@ def solve(problem: Problem, state: State, options: Options | None = None) -> Res
     descent.judge_at(options.robust_scale_px)
     status = descent.run()
 
-    variance = math.nan
-    if solver.focal_free:
-        variances = _read(*(solver.log_focal_variance(descent.system(), damping) for damping in _SIGMA_DAMPINGS))
-        variance = next((value for value in variances if value > 0), math.nan)
+    covariance = _intrinsics_covariance(solver, descent) if any(solver.intrinsics_free) else ((0.0, 0.0), (0.0, 0.0))
     measured, weight = _read(descent.cost.measurements, descent.cost.weight)
-    sigma = math.sqrt(variance) if variance > 0 else math.nan
-    return Result(descent.state, status, descent.iterations, initial_cost, measured, weight, sigma)
+    return Result(descent.state, status, descent.iterations, initial_cost, measured, weight, covariance)
+
+
+def _intrinsics_covariance(solver: Solver[Any], descent: _Descent) -> Covariance:
+    """By the least damping at which the system can be solved."""
+    found = [solver.intrinsics_covariance(descent.system(), damping) for damping in _SIGMA_DAMPINGS]
+    values = _read(*torch.stack(found).flatten())
+    for start in range(0, len(values), 4):
+        a, b, c, d = values[start : start + 4]
+        if all(value > 0 for value, free in zip((a, d), solver.intrinsics_free, strict=True) if free):
+            return (a, b), (c, d)
+    nan = math.nan
+    return (nan, nan), (nan, nan)
 
 
 class _Descent:

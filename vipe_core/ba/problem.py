@@ -12,6 +12,7 @@ Paper section 3.2, equations of the dense term and of the depth prior; `torch_so
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Literal
@@ -21,6 +22,7 @@ from torch import Tensor
 
 from vipe_core.cameras import CameraModel
 
+Covariance = tuple[tuple[float, float], tuple[float, float]]
 RobustKernel = Literal["none", "huber", "cauchy", "geman_mcclure", "tukey"]
 
 
@@ -191,7 +193,8 @@ class Result:
         cost: Robust cost after.
         weight_sum: Sum of these w over valid measurements at the end; `cost / weight_sum` is a mean squared residual,
             px^2.
-        log_focal_sigma: 1-sigma of log(f) from the reduced system at the end; NaN when the focal length was fixed.
+        intrinsics_covariance: ((var, cov), (cov, var)) of log(f) and alpha from the reduced system at the end, with
+            everything else marginalised; 0 for what was fixed, NaN where the system says nothing.
     """
 
     state: State
@@ -200,4 +203,10 @@ class Result:
     initial_cost: float
     cost: float
     weight_sum: float
-    log_focal_sigma: float = float("nan")
+    intrinsics_covariance: Covariance = ((0.0, 0.0), (0.0, 0.0))
+
+    @property
+    def log_focal_sigma(self) -> float:
+        """1-sigma of log(f); NaN when the focal length was fixed."""
+        variance = self.intrinsics_covariance[0][0]
+        return math.sqrt(variance) if variance > 0 else math.nan

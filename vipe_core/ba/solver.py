@@ -76,11 +76,11 @@ class Solver(Protocol[System]):
 
     Attributes:
         anything_free: Whether there is an unknown.
-        focal_free: Whether the focal length is one.
+        intrinsics_free: Whether log f and alpha are.
     """
 
     anything_free: bool
-    focal_free: bool
+    intrinsics_free: tuple[bool, bool]
 
     def cost(self, state: State, scale_px: float) -> Cost:
         """The robust cost at a state."""
@@ -94,5 +94,6 @@ class Solver(Protocol[System]):
     def retract(self, state: State, step: Step) -> State:
         """The state after a step. Whatever the step does not touch keeps its bits."""
 
-    def log_focal_variance(self, system: System, damping: float) -> Tensor:
-        """Variance of log f with everything else marginalised; NaN where the damped system is singular. 0-dim."""
+    def intrinsics_covariance(self, system: System, damping: float) -> Tensor:
+        """(2, 2) covariance of log f and alpha with everything else marginalised: 0 for what is held, NaN where the
+        damped system is singular."""

@@ -144,14 +144,13 @@ class TorchSolver:
         self.problem, self.options = problem, options
         self.dtype, self.device = state.inverse_depth.dtype, state.inverse_depth.device
         self.plan = plan = build_plan(problem, self.device)
-        self.focal_free = plan.focal_column is not None
+        self.intrinsics_free = (plan.focal_column is not None, plan.alpha_column is not None)
         self.anything_free = plan.num_columns > 0 or plan.any_depth_free
         self._sample_px = problem.grid.sample_px(device=self.device)
         median = state.inverse_depth.median()
         self._depth_range = (options.min_inverse_depth * median, options.max_inverse_depth * median)
         # (log f, alpha) of the camera functions -> those that are free.
-        columns = (plan.focal_column, plan.alpha_column)
-        self._free_intrinsics = [i for i, column in enumerate(columns) if column is not None]
+        self._free_intrinsics = [i for i, free in enumerate(self.intrinsics_free) if free]
         cells = len(problem.edges.source) * problem.grid.num_cells
         keep_bytes = _CPU_KEEP_BYTES if self.device.type == "cpu" else _GPU_KEEP_BYTES
         self._keep = cells * 12 * self.dtype.itemsize <= keep_bytes
@@ -218,7 +217,7 @@ class TorchSolver:
 
     def _cost(self, sums: Tensor, state: State) -> Cost:
         priors, prior_cost = self.problem.priors, sums[3]
-        if priors.log_focal is not None and self.focal_free:
+        if priors.log_focal is not None and self.intrinsics_free[0]:
             prior_cost = prior_cost + ((state.intrinsics[0].log() - priors.log_focal) / priors.log_focal_sigma) ** 2
         return Cost(sums[0], sums[1], sums[2] - sums[1], prior_cost)
 
@@ -412,15 +411,18 @@ class TorchSolver:
                 inverse_depth[chunk.frames] = moved.clamp(*self._depth_range)
         return State(se3.exp(step.pose) @ state.cam_from_world, inverse_depth, intrinsics)
 
-    def log_focal_variance(self, system: Linearisation, damping: float) -> Tensor:
-        """Variance of log f with everything else marginalised; NaN where the damped system is singular. 0-dim."""
-        column = self.plan.focal_column
-        assert column is not None
+    def intrinsics_covariance(self, system: Linearisation, damping: float) -> Tensor:
+        """See `Solver.intrinsics_covariance`."""
         scale, factor, _, factorised = self._factorise(system, damping)
-        unit = torch.zeros_like(scale)
-        unit[column] = scale[column]
-        variance = scale[column] * torch.cholesky_solve(unit[:, None], factor)[column, 0]
-        return torch.where(factorised & (scale[column] > 0), variance, torch.nan)
+        at = self._free_intrinsics
+        columns = [c for c in (self.plan.focal_column, self.plan.alpha_column) if c is not None]
+        units = torch.zeros(len(scale), len(columns), dtype=scale.dtype, device=scale.device)
+        units[columns, range(len(columns))] = scale[columns]
+        found = scale[columns][:, None] * torch.cholesky_solve(units, factor)[columns]
+        covariance = torch.zeros(2, 2, dtype=torch.float64, device=scale.device)
+        sound = factorised & (scale[columns] > 0).all()
+        covariance[torch.tensor(at)[:, None], torch.tensor(at)] = torch.where(sound, found, torch.nan)
+        return covariance
 
 
 def _border(per_edge: Tensor) -> Tensor:
