@@ -8,7 +8,7 @@ is not observable. The answer is the weighted median; its sigma comes from how w
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,13 +16,9 @@ import poselib
 from numpy.typing import NDArray
 
 from vipe_core.priors.classical.claims import FocalClaim
-from vipe_core.priors.classical.features import FlowFeatures, cell_centres_px
-from vipe_core.priors.classical.flow import DisFlowMatcher
+from vipe_core.priors.classical.pairs import FramePair, PairPicker
 from vipe_core.priors.protocols import WorkingFrame
 
-# Where motion stops growing before it reaches the wanted amount, a pair is still taken from this share on.
-_ENOUGH_MOTION = 0.5
-_STILL_GROWING = 1.15
 # A pair of which only this share (or more) of the cells is matched consistently has its full weight.
 _FULL_CONSISTENCY = 0.5
 _MIN_TOTAL_WEIGHT = 0.05
@@ -41,7 +37,7 @@ class FocalVote:
     """What one pair of frames says.
 
     Attributes:
-        source, target: Positions in the sequence that `votes` was given.
+        source, target: Positions in the sequence of frames.
         focal_px: Focal length at the working resolution.
         weight: Inlier ratio x (1 - homography inlier ratio), less where little is matched, 0..1.
         motion_px: Median displacement between the frames.
@@ -59,136 +55,48 @@ class FocalVote:
 class TwoViewFocal:
     """What pairs of frames say about the focal length.
 
-    Picks anchors and their partners itself and looks at no pair that the motion between them does not call for.
-
     Args:
-        matcher: Dense matcher; one of fine flow if None.
-        num_anchors: Frames that look for a partner.
-        motion_ratio: Wanted median displacement to the partner, share of the image width.
-        max_points: Upper bound of correspondences per pair.
+        picker: Where the pairs come from.
     """
 
-    def __init__(
-        self,
-        matcher: DisFlowMatcher | None = None,
-        num_anchors: int = 10,
-        motion_ratio: float = 30 / 640,
-        max_points: int = 1500,
-    ) -> None:
-        self._matcher = matcher or DisFlowMatcher(fine=True)
-        self._num_anchors = num_anchors
-        self._motion_ratio = motion_ratio
-        self._max_points = max_points
+    def __init__(self, picker: PairPicker | None = None) -> None:
+        self._picker = picker or PairPicker()
 
     def claim(self, frames: Sequence[WorkingFrame]) -> FocalClaim | None:
         """Weighted median of the votes; None when no pair shows parallax or a rotation."""
         return _claim(self.votes(frames))
 
     def votes(self, frames: Sequence[WorkingFrame]) -> list[FocalVote]:
-        """One vote for each anchor that found a partner and whose pair could be solved."""
-        last = len(frames) - 1
-        if last < 1:
+        """One vote for each pair that could be solved."""
+        if not frames:
             return []
-        features: dict[int, FlowFeatures] = {}
+        height, width = frames[0].gray.shape
+        votes = [_vote(pair, width, height) for pair in self._picker.pairs(frames)]
+        return [vote for vote in votes if vote is not None]
 
-        def at(position: int) -> FlowFeatures:
-            if position not in features:
-                features[position] = self._matcher.encode(frames[position])
-            return features[position]
 
-        anchors = np.unique(np.rint(np.linspace(0, last, self._num_anchors)).astype(int)).tolist()
-        pairs: dict[tuple[int, int], float] = {}
-        for anchor in anchors:
-            for direction in (1, -1):
-                found = self._partner(at, anchor, direction, last)
-                if found is not None:
-                    pairs.setdefault((min(anchor, found[0]), max(anchor, found[0])), found[1])
-                    break
-        solved = [self._vote(at(a), at(b), a, b, motion) for (a, b), motion in sorted(pairs.items())]
-        return [v for v in solved if v is not None]
-
-    def _partner(
-        self, at: Callable[[int], FlowFeatures], anchor: int, direction: int, last: int
-    ) -> tuple[int, float] | None:
-        """The nearest frame in `direction` that has moved enough: doubling steps, then bisection."""
-        source = at(anchor)
-        wanted = self._motion_ratio * source.gray.shape[1]
-
-        def motion(position: int) -> float:
-            return self._matcher.motion_px(source, at(position))
-
-        end = last if direction > 0 else 0
-        low, moved_low, step = anchor, 0.0, 1
-        while True:
-            high = low + direction * step
-            high = min(high, end) if direction > 0 else max(high, end)
-            if high == low:
-                return None
-            reached = motion(high)
-            if reached >= wanted:
-                break
-            if moved_low >= _ENOUGH_MOTION * wanted and reached < _STILL_GROWING * moved_low:
-                # Motion no longer grows with time: the flow has lost the scene (or the camera turns back).
-                return low, moved_low
-            low, moved_low, step = high, reached, step * 2
-        while abs(high - low) > 1:
-            middle = (low + high) // 2
-            moved = motion(middle)
-            if moved >= wanted:
-                high, reached = middle, moved
-            else:
-                low = middle
-        return high, reached
-
-    def _vote(
-        self, source: FlowFeatures, target: FlowFeatures, source_at: int, target_at: int, motion: float
-    ) -> FocalVote | None:
-        points = self._correspondences(source, target)
-        if points is None:
-            return None
-        height, width = source.gray.shape
-        first, second, consistent = points
-        trust = min(1.0, consistent / _FULL_CONSISTENCY)
-        ransac = {
-            "max_iterations": 1000,
-            "min_iterations": 200,
-            "max_epipolar_error": 1.0,
-            "max_reproj_error": 1.0,
-            "seed": 0,
-        }
-        pp = np.array([(width - 1) / 2, (height - 1) / 2])
-        pair, report = poselib.estimate_shared_focal_relative_pose(first, second, pp, ransac, {})
-        homography, flat = poselib.estimate_homography(first, second, ransac, {})
-        focal = float(pair.camera1.focal())
-        inliers, flat_inliers = float(report["inlier_ratio"]), float(flat["inlier_ratio"])
-        if not math.isfinite(focal) or not _MIN_FOCAL_RATIO * width < focal < _MAX_FOCAL_RATIO * width:
-            return None
-        turned = math.nan
-        if flat_inliers * trust > _ALL_FLAT:
-            turned = _rotation_focal(np.asarray(homography, np.float64), pp, width)
-        weight = inliers * max(0.0, 1 - flat_inliers) * trust
-        return FocalVote(source_at, target_at, focal, weight, motion, turned)
-
-    def _correspondences(
-        self, source: FlowFeatures, target: FlowFeatures
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64], float] | None:
-        """Consistent, corner-like cells, spread evenly over the frame; None when too few."""
-        forward, _ = self._matcher.match(source, target)
-        structure = source.structure
-        # Weight = agreement x structure; agreement of 0.3 is a forward-backward error of about 0.7 px.
-        agreement = (forward.weight * (structure + source.structure_floor) / np.maximum(structure, 1e-9)).max(axis=1)
-        corner = structure.min(axis=1)
-        usable = source.usable_cells
-        if not usable.any():
-            return None
-        bar = min(4.0, float(np.quantile(corner[usable], 0.6)))
-        kept = np.flatnonzero((agreement > 0.3) & (corner >= bar))
-        if len(kept) < 40:
-            return None
-        if len(kept) > self._max_points:
-            kept = kept[np.linspace(0, len(kept) - 1, self._max_points).astype(int)]
-        centres = cell_centres_px(source.grid)[kept]
-        return centres.astype(np.float64), forward.target_px[kept].astype(np.float64), forward.consistent
+def _vote(pair: FramePair, width: int, height: int) -> FocalVote | None:
+    first, second = pair.source_px, pair.target_px
+    trust = min(1.0, pair.consistent / _FULL_CONSISTENCY)
+    ransac = {
+        "max_iterations": 1000,
+        "min_iterations": 200,
+        "max_epipolar_error": 1.0,
+        "max_reproj_error": 1.0,
+        "seed": 0,
+    }
+    pp = np.array([(width - 1) / 2, (height - 1) / 2])
+    solved, report = poselib.estimate_shared_focal_relative_pose(first, second, pp, ransac, {})
+    homography, flat = poselib.estimate_homography(first, second, ransac, {})
+    focal = float(solved.camera1.focal())
+    inliers, flat_inliers = float(report["inlier_ratio"]), float(flat["inlier_ratio"])
+    if not math.isfinite(focal) or not _MIN_FOCAL_RATIO * width < focal < _MAX_FOCAL_RATIO * width:
+        return None
+    turned = math.nan
+    if flat_inliers * trust > _ALL_FLAT:
+        turned = _rotation_focal(np.asarray(homography, np.float64), pp, width)
+    weight = inliers * max(0.0, 1 - flat_inliers) * trust
+    return FocalVote(pair.source, pair.target, focal, weight, pair.motion_px, turned)
 
 
 def _claim(votes: Sequence[FocalVote]) -> FocalClaim | None:
