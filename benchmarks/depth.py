@@ -42,7 +42,7 @@ from benchmarks.cpu_time import cpu_s
 from benchmarks.long_video import Looped
 from benchmarks.peers.stereo import stereo_depth
 from benchmarks.sequences import DATA, BenchSequence, find_sequence
-from vipe_core.annotation import DepthKind
+from vipe_core.annotation import depth_kind_of
 from vipe_core.depth.geometry import KeyframePrior, length_of, relative
 from vipe_core.depth.scene import scene_of
 from vipe_core.depth.stream import DenseDepth
@@ -212,7 +212,7 @@ def collect(sequence: BenchSequence, truth: GroundTruth, scene: SceneMap, settin
 
             def sampled(depth: Array) -> NDArray[np.float32]:
                 lens = scene.camera if truth.camera is None else truth.camera
-                kind: DepthKind = "z" if scene.camera.model == "pinhole" else "ray"
+                kind = depth_kind_of(scene.camera)
                 return convert_depth(
                     sample_at_truth(np.asarray(depth, np.float32), truth), lens, kind, truth.depth_kind
                 )
