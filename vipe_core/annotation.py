@@ -16,6 +16,11 @@ DepthKind = Literal["z", "ray"]
 Reliability = Literal["yes", "doubtful", "no"]
 
 
+def depth_kind_of(camera: Camera) -> DepthKind:
+    """`z` for pinhole; `ray` for the models that see sideways, where z would be zero or negative."""
+    return "z" if camera.model == "pinhole" else "ray"
+
+
 @dataclass(frozen=True, slots=True)
 class Quality:
     """What the engine knows about its own result.

@@ -32,6 +32,13 @@ def cameras() -> tuple[str, ...]:
     return CAMERAS
 
 
+def camera_of(preset: str) -> str:
+    """The camera model that a preset takes where a job names none."""
+    from vipe_core.pipeline.presets import resolve
+
+    return resolve(preset).camera
+
+
 def one_of(value: str, offered: tuple[str, ...]) -> str:
     if value not in offered:
         raise ValueError(f"{value!r} is not on offer; on offer: {', '.join(offered)}")

@@ -39,8 +39,11 @@ class JobRequest(ControlFields):
         max_length=64,
         description="Engine preset: `classical`, or `classical_fast` with coarser dense depth for less time.",
     )
-    camera: Annotated[str, AfterValidator(lambda v: offer.one_of(v, offer.cameras()))] = Field(
-        default="pinhole", max_length=64, description="Camera model."
+    camera: Annotated[str, AfterValidator(lambda v: offer.one_of(v, offer.cameras()))] | None = Field(
+        default=None,
+        max_length=64,
+        description="Camera model: `pinhole`, `mei` (wide angle), or `auto` for what each video says. Default: the "
+        "preset's own.",
     )
     attributes: list[offer.OfferedAttribute] = Field(
         default_factory=lambda: list(DEFAULT_ATTRIBUTES),
@@ -78,7 +81,7 @@ class JobRequest(ControlFields):
             inputs=tuple(self.inputs),
             output=self.output.rstrip("/"),
             preset=self.preset,
-            camera=self.camera,
+            camera=self.camera or offer.camera_of(self.preset),
             attributes=tuple(a for a in offer.ATTRIBUTES if a in wanted),
             shard_max_videos=self.shard_max_videos,
             shard_max_input_bytes=self.shard_max_input_bytes,

@@ -23,8 +23,12 @@ def annotate(
             "-o", "--output", metavar="OUT", help="Gets pose/, intrinsics/, depth/, rgb/, mask/, confidence/."
         ),
     ],
-    preset: Annotated[str, typer.Option(help="classical, or classical_fast: coarser dense depth.")] = "classical",
-    camera: Annotated[str, typer.Option(help="Camera model.")] = "pinhole",
+    preset: Annotated[
+        str, typer.Option(help="classical; classical_fast: coarser dense depth; wide_angle: a bent lens.")
+    ] = "classical",
+    camera: Annotated[
+        str | None, typer.Option(help="pinhole, mei (wide angle), or auto. Default: the preset's own.")
+    ] = None,
     device: Annotated[str, typer.Option(help="cpu or cuda.")] = "cpu",
     masks: Annotated[
         Path | None,

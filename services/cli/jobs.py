@@ -58,8 +58,12 @@ def submit(
     output: Annotated[
         str, typer.Option("-o", "--output", metavar="OUT", help="Directory or s3://bucket/prefix of this job.")
     ],
-    preset: Annotated[str, typer.Option(help="classical, or classical_fast: coarser dense depth.")] = "classical",
-    camera: str = "pinhole",
+    preset: Annotated[
+        str, typer.Option(help="classical; classical_fast: coarser dense depth; wide_angle: a bent lens.")
+    ] = "classical",
+    camera: Annotated[
+        str | None, typer.Option(help="pinhole, mei (wide angle), or auto. Default: the preset's own.")
+    ] = None,
     name: str = "",
     scale_from: Annotated[
         str | None,
@@ -88,13 +92,14 @@ def submit(
         "inputs": [absolute(item) for item in inputs],
         "output": absolute(output).rstrip("/"),
         "preset": preset,
-        "camera": camera,
         "name": name,
         "priority": priority,
         **_limits(deadline, max_slot_hours),
     }
     if webhook is not None:
         spec["webhook"] = {"url": webhook, "secret": webhook_secret or ""}
+    if camera is not None:
+        spec["camera"] = camera
     if scale_from is not None:
         spec["scale_from"] = scale_from
     if attributes is not None:

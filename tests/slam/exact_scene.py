@@ -31,24 +31,35 @@ class ExactScene:
 
     Args:
         outliers: Share of cells whose measurement is noise.
+        camera: Of `WIDTH` x `HEIGHT` pixels.
+        ripple: Depth of the waves; a wide camera sees around those that are too deep.
     """
 
-    def __init__(self, cam_from_world: NDArray[np.float64], *, outliers: float = 0.0) -> None:
+    def __init__(
+        self,
+        cam_from_world: NDArray[np.float64],
+        *,
+        outliers: float = 0.0,
+        camera: Camera = CAMERA,
+        ripple: float = 0.7,
+    ) -> None:
         self.cam_from_world = cam_from_world
-        self.reprojector = Reprojector("pinhole", GRID)
-        self.params = CAMERA.index_params()
+        self.reprojector = Reprojector(camera.model, GRID)
+        self.camera = camera
+        self.params = camera.index_params()
+        self._ripple = ripple
         self.inverse_depth = [self._intersect(pose) for pose in cam_from_world]
         self._outliers = outliers
 
     def _intersect(self, cam_from_world: NDArray[np.float64]) -> NDArray[np.float64]:
         world_from_cam = inverse(cam_from_world)
         px = GRID.sample_px().numpy()
-        rays = np.concatenate([(px - self.params[2:4]) / self.params[:2], np.ones((len(px), 1))], axis=1)
+        rays = self.camera.unproject(px)
         rays, centre = rays @ world_from_cam[:3, :3].T, world_from_cam[:3, 3]
         depth = np.full(len(rays), 3.0)
         for _ in range(60):
             point = centre + depth[:, None] * rays
-            wall = 3.0 + 0.7 * np.sin(1.7 * point[:, 0]) * np.cos(1.3 * point[:, 1])
+            wall = 3.0 + self._ripple * np.sin(1.7 * point[:, 0]) * np.cos(1.3 * point[:, 1])
             depth = depth + 0.5 * (wall - point[:, 2]) / rays[:, 2]
         return 1.0 / depth
 
@@ -82,9 +93,16 @@ class ExactScene:
     def match_fast(self, source: int, target: int, guess_px: object = None) -> Match:
         return self.measure(source, target)
 
-    def priors(self, fov_deg: float = 60.0, sigma: float = 0.1, rivals_deg: Sequence[float] = ()) -> PriorFamily:
-        """The scene as its own matcher, and an initial camera of the given field of view."""
-        return PriorFamily(matcher=self, tracker=None, points=None, intrinsics=_Guess(fov_deg, sigma, rivals_deg))
+    def priors(
+        self,
+        fov_deg: float = 60.0,
+        sigma: float = 0.1,
+        rivals_deg: Sequence[float] = (),
+        camera: Camera | None = None,
+    ) -> PriorFamily:
+        """The scene as its own matcher, and an initial camera: a pinhole of the given field of view, or `camera`."""
+        start = Camera.pinhole_from_fov(fov_deg, WIDTH, HEIGHT) if camera is None else camera
+        return PriorFamily(matcher=self, tracker=None, points=None, intrinsics=_Guess(start, sigma, rivals_deg))
 
     # -- the frame source: pictures are blank, only their number counts --------------------------------------------
 
@@ -99,10 +117,9 @@ class ExactScene:
 
 
 class _Guess:
-    def __init__(self, fov_deg: float, sigma: float, rivals_deg: Sequence[float]) -> None:
-        self._fov_deg, self._sigma, self._rivals_deg = fov_deg, sigma, rivals_deg
+    def __init__(self, camera: Camera, sigma: float, rivals_deg: Sequence[float]) -> None:
+        self._camera, self._sigma, self._rivals_deg = camera, sigma, rivals_deg
 
     def estimate(self, frames: Sequence[WorkingFrame], grid: Grid) -> IntrinsicsEstimate:
-        camera = Camera.pinhole_from_fov(self._fov_deg, grid.width * 8, grid.height * 8)
         rivals = [Camera.pinhole_from_fov(fov, grid.width * 8, grid.height * 8) for fov in self._rivals_deg]
-        return IntrinsicsEstimate(camera, self._sigma, 1, tuple(rival.focal_px for rival in rivals))
+        return IntrinsicsEstimate(self._camera, self._sigma, 1, tuple(rival.focal_px for rival in rivals))

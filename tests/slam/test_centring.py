@@ -21,7 +21,7 @@ def adjusted(offset_px: float, count: int = COUNT) -> tuple[KeyframeMap, Graph, 
     scene = ExactScene(trajectory(count, (0.12, 0.01, 0.02, 0.004, -0.05, 0.003)))
     intrinsics = np.array(scene.params)
     intrinsics[2] += offset_px
-    keyframes, graph = KeyframeMap(GRID, intrinsics), Graph()
+    keyframes, graph = KeyframeMap(GRID, "pinhole", intrinsics), Graph()
     noise = np.random.default_rng(0)
     for k in range(count):
         keyframes.append(Keyframe(k, k), k / 30.0, scene.cam_from_world[k], scene.inverse_depth[k])

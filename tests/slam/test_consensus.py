@@ -35,7 +35,7 @@ def moved(match: Match, cells: NDArray[np.bool_], by_px: tuple[float, float], st
 
 
 def placed_map(scene: ExactScene, count: int) -> KeyframeMap:
-    keyframes = KeyframeMap(GRID, scene.params)
+    keyframes = KeyframeMap(GRID, "pinhole", scene.params)
     for k in range(count):
         keyframes.append(Keyframe(k, k), float(k), scene.cam_from_world[k], scene.inverse_depth[k])
     return keyframes

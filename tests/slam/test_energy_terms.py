@@ -72,7 +72,7 @@ def test_masks_are_found_only_where_they_are_on() -> None:
 @pytest.mark.parametrize("dense_flow", [True, False])
 def test_what_is_filed_in_the_graph(sparse: bool, dense_flow: bool) -> None:
     scene = ExactScene(trajectory(2, ARC))
-    keyframes = KeyframeMap(GRID, scene.params)
+    keyframes = KeyframeMap(GRID, "pinhole", scene.params)
     for k in range(2):
         keyframes.append(Keyframe(k, k), k / 30, np.eye(4), np.ones(GRID.num_cells))
     graph = Graph()

@@ -62,7 +62,7 @@ def test_an_alignment_replaces_flow_it_agrees_with_and_flow_stays_where_they_con
 
 def test_masks_apply_when_edges_are_read_and_the_measurement_stays() -> None:
     grid = Grid(1, 2)
-    keyframes = KeyframeMap(grid, Camera.pinhole_from_fov(60, 16, 8).index_params())
+    keyframes = KeyframeMap(grid, "pinhole", Camera.pinhole_from_fov(60, 16, 8).index_params())
     for index in range(2):
         keyframes.append(Keyframe(index, None), float(index), np.eye(4), np.ones(2))
     graph = Graph()
@@ -81,7 +81,7 @@ def test_loop_edges_keep_their_distance_from_each_other() -> None:
 
 
 def test_scale_is_normalised_without_moving_a_reprojection() -> None:
-    keyframes = KeyframeMap(Grid(1, 2), Camera.pinhole_from_fov(60, 16, 8).index_params())
+    keyframes = KeyframeMap(Grid(1, 2), "pinhole", Camera.pinhole_from_fov(60, 16, 8).index_params())
     pose = np.eye(4)
     pose[:3, 3] = (1.0, 2.0, 3.0)
     keyframes.append(Keyframe(0, None), 0.0, pose, np.array([2.0, 6.0]))

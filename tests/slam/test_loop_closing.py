@@ -64,7 +64,7 @@ class Drifted:
         self.truth = there_and_back(half)
         count = len(self.truth)
         self.scene = ExactScene(self.truth)
-        self.keyframes = KeyframeMap(GRID, self.scene.params)
+        self.keyframes = KeyframeMap(GRID, "pinhole", self.scene.params)
         graph = Graph()
         places = [min(k, count - 1 - k) // 2 for k in range(count)]
         adjuster = Adjuster(

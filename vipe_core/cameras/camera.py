@@ -129,6 +129,13 @@ class Camera:
 
         return torch.from_numpy(values)
 
+    def zoomed(self, ratio: float) -> Camera:
+        """The same camera with a focal length `ratio` times as long; `equirect` has none and stays."""
+        if not self.params:
+            return self
+        fx, fy, *rest = self.params
+        return Camera(self.model, (fx * ratio, fy * ratio, *rest), self.width, self.height)
+
     def resized(self, width: int, height: int) -> Camera:
         """The same camera for an image resized (not cropped) to `width` x `height`."""
         sx, sy = width / self.width, height / self.height

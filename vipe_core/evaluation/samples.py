@@ -23,12 +23,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from vipe_core.annotation import depth_kind_of
 from vipe_core.cameras import Camera
 from vipe_core.errors import ConfigError
 from vipe_core.evaluation import synthetic
 from vipe_core.evaluation.synthetic.crowd import CROWD_FPS, crowd
 from vipe_core.evaluation.synthetic.paths import arc, handheld, look_at, through
-from vipe_core.evaluation.synthetic.render import depth_kind_of, render_frames
+from vipe_core.evaluation.synthetic.render import render_frames
 from vipe_core.evaluation.synthetic.scene import Scene
 from vipe_core.evaluation.synthetic.scenes import courtyard_scene, moving_ball_scene, room_scene
 from vipe_core.video.encode import VideoWriter

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from vipe_core.annotation import Annotation, DenseFrame, Progress, ProgressCallback, Provenance
+from vipe_core.annotation import Annotation, DenseFrame, Progress, ProgressCallback, Provenance, depth_kind_of
 from vipe_core.depth.aligned import AlignedDepth
 from vipe_core.depth.known import KnownLength
 from vipe_core.depth.scene import scene_of
@@ -37,7 +37,7 @@ class Annotator:
 
     Args:
         preset: Name of a preset, or a `Preset` of one's own.
-        camera: Camera model to estimate.
+        camera: Camera model to estimate, `pinhole`, `mei` (wide angle) or `auto`; the preset's own if None.
         device: `cpu`, `cuda` or `cuda:N`: where bundle adjustment runs.
         threads: CPU threads of torch and OpenCV in this process. The result depends on it in the last digits; one is
             the choice that gives the same bytes everywhere, and the most videos per hour of a machine.
@@ -49,7 +49,7 @@ class Annotator:
     def __init__(
         self,
         preset: str | Preset = "classical",
-        camera: str = "pinhole",
+        camera: str | None = None,
         device: str = "cpu",
         *,
         threads: int = 1,
@@ -96,7 +96,7 @@ class Annotator:
 
         # New matchers for each video: OpenCV's flow object keeps buffers of the last picture size and is not safe to
         # use with another one, and nothing of one video may reach the next.
-        slam = Slam(classical_priors(), self.preset.slam, self.device)
+        slam = Slam(classical_priors(self.preset.camera), self.preset.slam, self.device)
         with _typed_errors(source, report), torch.inference_mode():
             result = slam.run(source, report)
             quality = assess(result, self.preset.slam, source.info.width)
@@ -119,7 +119,7 @@ class Annotator:
             fps=source.info.fps,
             keyframes=result.keyframes,
             scale=scaled.scale,
-            depth_kind="z",
+            depth_kind=depth_kind_of(result.camera),
             quality=quality,
             provenance=self._provenance(source, scaled),
             dense=lambda: self._dense(source, scaled, timings, report),
@@ -219,7 +219,7 @@ def annotate(
     video: str | Path,
     *,
     preset: str | Preset = "classical",
-    camera: str = "pinhole",
+    camera: str | None = None,
     device: str = "cpu",
     masks: str | Path | None = None,
     scale_from: str | None = None,

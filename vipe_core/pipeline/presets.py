@@ -12,7 +12,7 @@ from vipe_core.depth.types import DepthSettings
 from vipe_core.errors import ConfigError
 from vipe_core.slam.settings import SlamSettings
 
-CAMERAS = ("pinhole",)
+CAMERAS = ("pinhole", "mei", "auto")
 
 
 @dataclass(frozen=True, slots=True)
@@ -21,7 +21,7 @@ class Preset:
 
     Attributes:
         name: Name that users choose it by.
-        camera: Camera model that is estimated.
+        camera: Camera model that is estimated; `auto` for what the video says.
         matcher: Provider of dense matching.
         sparse: Provider of sparse tracks.
         intrinsics: Provider of the initial camera.
@@ -74,15 +74,22 @@ _PRESETS = {
     for preset in (
         _CLASSICAL,
         dataclasses.replace(_CLASSICAL, name="classical_fast", dense_depth=DepthSettings.fast()),
+        dataclasses.replace(_CLASSICAL, name="wide_angle", camera="mei"),
     )
+}
+_INTRINSICS = {
+    "pinhole": "classical.two_view_focal",
+    "mei": "classical.unified_sweep",
+    "auto": "classical.unified_sweep",
 }
 
 PRESETS = tuple(_PRESETS)
-"""Names, the default first. `classical_fast` has the same poses and map, and coarser dense depth for less time."""
+"""Names, the default first. `classical_fast` has the same poses and map, and coarser dense depth for less time;
+`wide_angle` estimates the bend of the lens as well."""
 
 
-def resolve(preset: str | Preset, camera: str = "pinhole") -> Preset:
-    """The preset of that name, for that camera model.
+def resolve(preset: str | Preset, camera: str | None = None) -> Preset:
+    """The preset of that name, for that camera model or its own.
 
     Raises:
         ConfigError: It is not on offer; the message lists what is.
@@ -93,6 +100,7 @@ def resolve(preset: str | Preset, camera: str = "pinhole") -> Preset:
         found = _PRESETS[preset]
     else:
         raise ConfigError(f"unknown preset {preset!r}; on offer: {', '.join(PRESETS)}")
+    camera = found.camera if camera is None else camera
     if camera not in CAMERAS:
         raise ConfigError(f"camera model {camera!r} is not on offer for annotation; on offer: {', '.join(CAMERAS)}")
-    return dataclasses.replace(found, camera=camera)
+    return dataclasses.replace(found, camera=camera, intrinsics=_INTRINSICS[camera])

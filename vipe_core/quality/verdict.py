@@ -115,5 +115,4 @@ def _fov_interval_deg(result: SlamResult) -> tuple[float, float]:
     """The field of view for the focal length's 95 % interval, in which log(f) is taken to be normal."""
     camera = result.camera
     half = math.exp(1.96 * min(result.focal_sigma_ratio, _NO_IDEA))
-    low, high = (2 * math.degrees(math.atan(camera.width / 2 / (camera.focal_px * f))) for f in (half, 1 / half))
-    return low, high
+    return camera.zoomed(half).fov_x_deg, camera.zoomed(1 / half).fov_x_deg

@@ -78,11 +78,13 @@ class FocalPrior:
 
     Attributes:
         rivals: Other values of log(fx) for which there is evidence.
+        same_lens: The other intrinsics are known as well and held.
     """
 
     log_focal: float
     sigma: float
     rivals: tuple[float, ...] = ()
+    same_lens: bool = False
 
 
 class Adjuster:
@@ -178,13 +180,14 @@ class Adjuster:
         if free_depth and self.settings.terms.depth_prior:
             prior, prior_weight = self._depth_prior(keyframes, graph, frames, edges, number, depths)
         problem = Problem(
-            camera_model="pinhole",
+            camera_model=keyframes.camera_model,
             grid=keyframes.grid,
             edges=measured,
             free=Free(
                 poses=torch.tensor([k not in held for k in frames], device=self.device),
                 inverse_depth=torch.full((len(frames),), free_depth, dtype=torch.bool, device=self.device),
                 focal=free_focal,
+                distortion=free_focal and not self.focal_prior.same_lens,
             ),
             priors=Priors(
                 inverse_depth=prior,

@@ -14,6 +14,7 @@ from vipe_core.ba.problem import Result
 from vipe_core.slam.adjustment import REFINE, SETTLE, Adjuster, Step
 from vipe_core.slam.centring import refine_principal_point
 from vipe_core.slam.closing import LoopCloser
+from vipe_core.slam.lens import focal_sigma_ratio
 from vipe_core.slam.masks import MotionMasks
 from vipe_core.slam.measuring import MeasuredGraph
 from vipe_core.slam.proximity import close_pairs, loop_edges
@@ -24,7 +25,8 @@ logger = logging.getLogger(__name__)
 
 Array = NDArray[Any]
 
-_FOV_RANGE_DEG = (12.0, 150.0)
+_MIN_FOV_DEG = 12.0
+_MAX_FOV_DEG = {"pinhole": 150.0, "mei": 320.0}
 # Share of a keyframe's cells whose change of mask calls for another adjustment.
 _VISIBLE_CHANGE = 0.02
 _SUBSAMPLE = 4
@@ -141,9 +143,11 @@ class Backend:
         if result is None:
             return None
         # A pinhole leaves out the distortion of a real lens, which more measurements do not average away.
-        sigma = math.hypot(self._settings.focal_sigma_inflation * result.log_focal_sigma, self._settings.lens_sigma)
-        fov_deg = math.degrees(2 * math.atan(self._width / 2 / float(self._keyframes.intrinsics[0])))
-        if math.isfinite(sigma) and _FOV_RANGE_DEG[0] < fov_deg < _FOV_RANGE_DEG[1]:
+        camera = self._keyframes.camera
+        formal = focal_sigma_ratio(camera, result.intrinsics_covariance)
+        sigma = math.hypot(self._settings.focal_sigma_inflation * formal, self._settings.lens_sigma)
+        fov_deg = camera.fov_x_deg
+        if math.isfinite(sigma) and _MIN_FOV_DEG < fov_deg < _MAX_FOV_DEG[camera.model]:
             self.focal_sigma_ratio = sigma
             return result
         logger.info("focal length held: it went to a field of view of %.1f deg, sigma %.3f", fov_deg, sigma)

@@ -20,8 +20,9 @@ import numpy as np
 import poselib
 from numpy.typing import NDArray
 
+from vipe_core.cameras.ideal import ideal_camera, ideal_px
 from vipe_core.slam.adjustment import FROM_SCRATCH, REFINE, TRACK, Adjuster, FocalPrior, Step
-from vipe_core.slam.consensus import MIN_WEIGHT, consensus_pose, pinhole_camera
+from vipe_core.slam.consensus import MIN_WEIGHT, consensus_pose
 from vipe_core.slam.masks import MotionMasks
 from vipe_core.slam.measuring import MeasuredGraph
 from vipe_core.slam.reprojection import Reprojector, splat_inverse_depth
@@ -132,7 +133,7 @@ class Bootstrap:
             for k in everything:
                 keyframes.set_static(k, np.ones(keyframes.grid.num_cells, dtype=np.bool_))
             scale = math.exp(log_focal - prior.log_focal)
-            keyframes.intrinsics = keyframes.intrinsics * np.array([scale, scale, 1.0, 1.0])
+            keyframes.intrinsics[:2] *= scale
             self._start()
             self._adjuster.adjust(keyframes, self._graph, everything, (0,), REFINE, free_focal=True)
             self._masks.update(everything)
@@ -201,9 +202,13 @@ class Bootstrap:
         if len(kept) < _MIN_POINTS:
             return None
         kept = kept[np.linspace(0, len(kept) - 1, min(len(kept), _MAX_POINTS)).astype(np.int64)]
-        source = self._keyframes.grid.sample_px().numpy()[kept]
-        target = match.target_px[kept].astype(np.float64)
-        camera = pinhole_camera(self._keyframes)
+        camera = self._keyframes.camera
+        source, imaged = ideal_px(camera, self._keyframes.grid.sample_px().numpy()[kept])
+        target, seen = ideal_px(camera, match.target_px[kept])
+        both = imaged & seen
+        kept, source, target = kept[both], source[both], target[both]
+        if len(kept) < _MIN_POINTS:
+            return None
         error_px = 0.5 * self._grow_px
         ransac = {
             "max_iterations": 500,
@@ -211,7 +216,9 @@ class Bootstrap:
             "max_epipolar_error": error_px,
             "seed": 0,
         }
-        pose, report = poselib.estimate_relative_pose(source, target, camera, camera, ransac, {})
+        pose, report = poselib.estimate_relative_pose(
+            source, target, ideal_camera(camera), ideal_camera(camera), ransac, {}
+        )
         relative = np.eye(4)
         relative[:3, :3], relative[:3, 3] = pose.R, pose.t
         norm = float(np.linalg.norm(pose.t))
@@ -222,7 +229,7 @@ class Bootstrap:
         turned = relative.copy()
         turned[:3, 3] = 0
         rotated = self._reprojector.induced(self._keyframes.intrinsics, turned, np.ones(len(kept)), kept).target_px
-        parallax_px = float(np.nanmedian(np.linalg.norm(target - rotated, axis=1)[inliers]))
+        parallax_px = float(np.nanmedian(np.linalg.norm(match.target_px[kept] - rotated, axis=1)[inliers]))
         return Seed(i, j, relative, parallax_px, parallax_px * math.sqrt(int(inliers.sum())))
 
     def _grow(self, seed: Seed) -> bool:

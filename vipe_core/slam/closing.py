@@ -17,9 +17,9 @@ import numpy as np
 import poselib
 from numpy.typing import NDArray
 
+from vipe_core.cameras.ideal import ideal_camera, ideal_px
 from vipe_core.geometry.sim3 import Sim3
 from vipe_core.slam.adjustment import REFINE, Adjuster
-from vipe_core.slam.consensus import pinhole_camera
 from vipe_core.slam.measuring import MeasuredGraph
 from vipe_core.slam.places import similarity
 from vipe_core.slam.posegraph import SimLink, relax
@@ -215,11 +215,14 @@ class LoopCloser:
         cells = np.flatnonzero((match.weight.max(axis=1) > _MIN_WEIGHT) & self._keyframes.static(i))
         if len(cells) < _MIN_CELLS:
             return None
+        camera = self._keyframes.camera
+        seen, ahead = ideal_px(camera, match.target_px[cells])
+        cells, seen = cells[ahead], seen[ahead]
+        if len(cells) < _MIN_CELLS:
+            return None
         rays = self._reprojector.rays(self._keyframes.intrinsics)[cells]
         points = rays / np.maximum(self._keyframes.depth(i)[cells, None].astype(np.float64), 1e-6)
-        found, report = poselib.estimate_absolute_pose(
-            match.target_px[cells].astype(np.float64), points, pinhole_camera(self._keyframes), dict(_RESECTION), {}
-        )
+        found, report = poselib.estimate_absolute_pose(seen, points, ideal_camera(camera), dict(_RESECTION), {})
         pose = np.eye(4)
         pose[:3, :3], pose[:3, 3] = found.R, found.t
         if not np.isfinite(pose).all() or float(report["inlier_ratio"]) < _MIN_RIGID:

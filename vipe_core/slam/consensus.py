@@ -18,6 +18,7 @@ import numpy as np
 import poselib
 from numpy.typing import NDArray
 
+from vipe_core.cameras.ideal import ideal_camera, ideal_px
 from vipe_core.compilation import compiled
 from vipe_core.priors.protocols import Match
 from vipe_core.slam.keyframes import KeyframeMap
@@ -35,6 +36,8 @@ MAJORITY = 0.5
 _NO_BASELINE = 1e-18
 _MIN_POINTS = 50
 _MAX_POINTS = 600
+# The squared root of the unified model at which a pixel is taken to be off its image disk; `projection.py`.
+_MIN_DISK = 1e-6
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,7 +79,7 @@ def agree(
     proposal with the lowest truncated cost over all views wins.
 
     Args:
-        intrinsics: (4,) index parameters of a pinhole.
+        intrinsics: (K,) index parameters.
         target_from_source: (E, 4, 4), one per match; at least one.
         threshold_px: Where the cost of a measurement is cut off.
         current: (P,) inverse depth, or None.
@@ -92,7 +95,8 @@ def agree(
     error_px = np.empty((views, cells), np.float32)
     _agree(
         np.ascontiguousarray(rays),
-        np.asarray(intrinsics, dtype=np.float64),
+        np.append(np.asarray(intrinsics, dtype=np.float64), 0.0)[:5],
+        reprojector.model == "mei",
         relative,
         target_px,
         weight,
@@ -110,6 +114,7 @@ def agree(
 def _agree(
     rays: Array,
     intrinsics: Array,
+    unified: bool,
     relative: Array,
     target_px: Array,
     weight: Array,
@@ -120,11 +125,11 @@ def _agree(
     measured: Array,
     error_px: Array,
 ) -> None:
-    """`agree` cell by cell, for a pinhole.
+    """`agree` cell by cell, for a pinhole or the unified model with intrinsics (fx, fy, cx, cy, alpha).
 
     Along an edge of the picture the flow is not measured: that component counts by its share, as in the adjustment.
     """
-    fx, fy, cx, cy = intrinsics[0], intrinsics[1], intrinsics[2], intrinsics[3]
+    fx, fy, cx, cy, alpha = intrinsics[0], intrinsics[1], intrinsics[2], intrinsics[3], intrinsics[4]
     views = len(relative)
     turned = np.empty((views, 3))
     share = np.empty((views, 2))
@@ -150,12 +155,17 @@ def _agree(
                 # squares in d. It may be negative: behind the camera, or beyond infinity.
                 rx = (target_px[proposal, cell, 0] - cx) / fx
                 ry = (target_px[proposal, cell, 1] - cy) / fy
+                rz = 1.0
+                if unified:
+                    radius = rx * rx + ry * ry
+                    eta = (alpha + math.sqrt(max(1 + (1 - alpha * alpha) * radius, _MIN_DISK))) / (1 + radius)
+                    rx, ry, rz = eta * rx, eta * ry, eta - alpha
                 ax, ay, az = turned[proposal, 0], turned[proposal, 1], turned[proposal, 2]
                 bx, by, bz = relative[proposal, 0, 3], relative[proposal, 1, 3], relative[proposal, 2, 3]
-                ox, oy, oz = ry * az - ay, ax - rx * az, rx * ay - ry * ax
-                sx, sy, sz = ry * bz - by, bx - rx * bz, rx * by - ry * bx
+                ox, oy, oz = ry * az - rz * ay, rz * ax - rx * az, rx * ay - ry * ax
+                sx, sy, sz = ry * bz - rz * by, rz * bx - rx * bz, rx * by - ry * bx
                 length = sx * sx + sy * sy + sz * sz
-                if not length > _NO_BASELINE * (rx * rx + ry * ry + 1.0):
+                if not length > _NO_BASELINE * (rx * rx + ry * ry + rz * rz):
                     continue
                 depth = -(ox * sx + oy * sy + oz * sz) / length
             if not (depth > 0 and depth < np.inf):
@@ -168,9 +178,14 @@ def _agree(
                 px = turned[view, 0] + relative[view, 0, 3] * depth
                 py = turned[view, 1] + relative[view, 1, 3] * depth
                 pz = turned[view, 2] + relative[view, 2, 3] * depth
-                if pz > min_depth_ratio:
-                    du = fx * px / pz + cx - target_px[view, cell, 0]
-                    dv = fy * py / pz + cy - target_px[view, cell, 1]
+                ahead, scale = pz > min_depth_ratio, pz
+                if unified:
+                    norm = math.sqrt(px * px + py * py + pz * pz)
+                    scale = pz + alpha * norm
+                    ahead = norm > min_depth_ratio and scale > 1e-9 * norm and alpha * pz > -norm
+                if ahead:
+                    du = fx * px / scale + cx - target_px[view, cell, 0]
+                    dv = fy * py / scale + cy - target_px[view, cell, 1]
                     squared = share[view, 0] * du * du + share[view, 1] * dv * dv
                     if squared < np.inf:
                         error[view] = math.sqrt(squared)
@@ -210,25 +225,15 @@ def consensus_pose(
         local = rays[cells] / depth[:, None]
         points.append(local @ world_from_cam[:3, :3].T + world_from_cam[:3, 3])
         seen.append(match.target_px[cells].astype(np.float64))
-    world, px = np.concatenate(points), np.concatenate(seen)
+    world, (px, ahead) = np.concatenate(points), ideal_px(keyframes.camera, np.concatenate(seen))
+    world, px = world[ahead], px[ahead]
     if len(world) < _MIN_POINTS:
         return None
     kept = np.linspace(0, len(world) - 1, min(len(world), _MAX_POINTS * len(views))).astype(np.int64)
     ransac = {"max_iterations": 1000, "min_iterations": 100, "max_reproj_error": threshold_px, "seed": 0}
-    camera = pinhole_camera(keyframes)
+    camera = ideal_camera(keyframes.camera)
     pose, report = poselib.estimate_absolute_pose(px[kept], world[kept], camera, ransac, {})
     found = np.eye(4)
     found[:3, :3], found[:3, 3] = pose.R, pose.t
     share = float(report["inlier_ratio"])
     return (found, share) if np.isfinite(found).all() and math.isfinite(share) else None
-
-
-def pinhole_camera(keyframes: KeyframeMap) -> dict[str, Any]:
-    """The camera of the map in the form that PoseLib takes, for index coordinates."""
-    grid = keyframes.grid
-    return {
-        "model": "PINHOLE",
-        "width": int(grid.width * grid.stride),
-        "height": int(grid.height * grid.stride),
-        "params": [float(value) for value in keyframes.intrinsics[:4]],
-    }

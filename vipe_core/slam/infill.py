@@ -302,7 +302,7 @@ class _ShotInfill:
         depths = np.ones((total, self._keyframes.grid.num_cells), dtype=np.float32)
         depths[:first] = np.stack([self._keyframes.depth(k) for k in sources])
         problem = Problem(
-            camera_model="pinhole",
+            camera_model=self._keyframes.camera_model,
             grid=self._keyframes.grid,
             edges=edges,
             free=Free(

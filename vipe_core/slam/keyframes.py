@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vipe_core.ba.problem import Grid
+from vipe_core.cameras import Camera, CameraModel
 from vipe_core.slam.selection import Keyframe
 
 Array = NDArray[Any]
@@ -23,11 +24,13 @@ class KeyframeMap:
         cam_from_world: (K, 4, 4) float64.
         inverse_depth: (K, P) float32, positive.
         static: (K, P) bool, False on cells that appear to move by themselves.
-        intrinsics: (4,) float64 `Camera.index_params` at the working size.
+        camera_model: Of all of them.
+        intrinsics: (K,) float64 `Camera.index_params` at the working size.
     """
 
-    def __init__(self, grid: Grid, intrinsics: Array) -> None:
+    def __init__(self, grid: Grid, camera_model: CameraModel, intrinsics: Array) -> None:
         self.grid = grid
+        self.camera_model: CameraModel = camera_model
         self.intrinsics: NDArray[np.float64] = np.array(intrinsics, dtype=np.float64)
         self.frame_index: list[int] = []
         self.times_s: list[float] = []
@@ -38,6 +41,12 @@ class KeyframeMap:
 
     def __len__(self) -> int:
         return len(self.frame_index)
+
+    @property
+    def camera(self) -> Camera:
+        """The camera as it is known now, at the working size."""
+        width, height = (round(cells * self.grid.stride) for cells in (self.grid.width, self.grid.height))
+        return Camera.from_index_params(self.camera_model, self.intrinsics, width, height)
 
     def append(self, keyframe: Keyframe, time_s: float, cam_from_world: Array, inverse_depth: Array) -> int:
         """Add a keyframe and return its number."""

@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from vipe_core.cameras import CameraModel
 from vipe_core.priors.protocols import PriorFamily
 from vipe_core.slam.adjustment import Adjuster, FocalPrior
 from vipe_core.slam.backend import Backend
@@ -79,6 +80,7 @@ class ShotMapper:
         settings: SlamSettings,
         device: torch.device,
         size: WorkingSize,
+        camera_model: CameraModel,
         timestamps_s: NDArray[np.float64],
         clock: StageClock,
     ) -> None:
@@ -88,7 +90,8 @@ class ShotMapper:
         self._size = size
         self._times_s = timestamps_s
         self._clock = clock
-        self.reprojector = Reprojector("pinhole", size.grid)
+        self._model: CameraModel = camera_model
+        self.reprojector = Reprojector(camera_model, size.grid)
 
     def run(
         self,
@@ -107,7 +110,7 @@ class ShotMapper:
         """
         settings, size, reprojector = self._settings, self._size, self.reprojector
         scale_px = settings.scaled_px(1.0, size.width)
-        keyframes, graph = KeyframeMap(size.grid, intrinsics), Graph()
+        keyframes, graph = KeyframeMap(size.grid, self._model, intrinsics), Graph()
         adjuster = Adjuster(settings, self._device, prior, scale_px)
         measured = MeasuredGraph(
             keyframes,
@@ -150,7 +153,7 @@ class ShotMapper:
         motion: Motion = "static" if static else "general"
         focal_sigma_ratio, fitter = backend.focal_sigma_ratio, None
         if not static and found.parallax_deg < _MAYBE_ROTATION_DEG:
-            candidate = RotationFitter("pinhole", size.grid, adjuster.robust_scale_px)
+            candidate = RotationFitter(self._model, size.grid, adjuster.robust_scale_px)
             with self._clock("rotation"):
                 turned = self._rotation_only(candidate, keyframes, graph, prior, found)
             if turned is not None:

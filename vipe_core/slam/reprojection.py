@@ -52,7 +52,7 @@ class Reprojector:
     """Reprojection of grid cells with one camera model."""
 
     def __init__(self, model: CameraModel, grid: Grid) -> None:
-        self._model = model
+        self.model: CameraModel = model
         self.grid = grid
         self._px = grid.sample_px()
         self._size = torch.tensor([grid.width * grid.stride - 1, grid.height * grid.stride - 1], dtype=torch.float64)
@@ -61,7 +61,7 @@ class Reprojector:
         """(P, 3) rays of the cells, or of index coordinates `px` (P, 2)."""
         params = torch.from_numpy(np.asarray(intrinsics, dtype=np.float64))
         at = self._px if px is None else torch.from_numpy(np.asarray(px, dtype=np.float64))
-        return np.asarray(unproject(self._model, params, at).numpy())
+        return np.asarray(unproject(self.model, params, at).numpy())
 
     def induced(
         self, intrinsics: Array, target_from_source: Array, inverse_depth: Array, cells: Array | None = None
@@ -78,11 +78,11 @@ class Reprojector:
         relative = torch.from_numpy(np.asarray(target_from_source, dtype=np.float64))
         depth = torch.from_numpy(np.asarray(inverse_depth, dtype=np.float64))
         px = self._px if cells is None else self._px[torch.from_numpy(np.asarray(cells, dtype=np.int64))]
-        rays = unproject(self._model, params, px)
+        rays = unproject(self.model, params, px)
         points = rays @ relative[..., :3, :3].mT + relative[..., None, :3, 3] * depth[..., None]
-        target_px, valid = project(self._model, params, points)
+        target_px, valid = project(self.model, params, points)
         # The homogeneous scale starts at |ray|; what is left of it is the ratio of the depths.
-        length = points[..., 2] if self._model == "pinhole" else points.norm(dim=-1)
+        length = points[..., 2] if self.model == "pinhole" else points.norm(dim=-1)
         valid = valid & (length > MIN_DEPTH_RATIO)
         inside = ((target_px >= 0) & (target_px <= self._size)).all(-1)
         nan = torch.full_like(target_px, torch.nan)
@@ -100,7 +100,7 @@ class Reprojector:
         """(P,) angle at each point between its rays to the two camera centres, degrees."""
         params = torch.from_numpy(np.asarray(intrinsics, dtype=np.float64))
         relative = np.asarray(target_from_source, dtype=np.float64)
-        rays = unproject(self._model, params, self._px).numpy()
+        rays = unproject(self.model, params, self._px).numpy()
         # Both directions in the source frame, scaled by the inverse depth so that infinity stays finite.
         centre = -relative[:3, :3].T @ relative[:3, 3]
         other = rays - np.asarray(inverse_depth, dtype=np.float64)[:, None] * centre

@@ -105,7 +105,9 @@ class Slam:
         with clock("intrinsics"):
             estimate = self._initial_camera(source, selection, selection.shots[main], size)
             report("intrinsics", 1, 1)
-        mapper = ShotMapper(self._priors, settings, self._device, size, selection.timestamps_s, clock)
+        mapper = ShotMapper(
+            self._priors, settings, self._device, size, estimate.camera.model, selection.timestamps_s, clock
+        )
         maps = self._map(mapper, selection, main, estimate, report)
         with clock("infill"):
             tracks_only = None if settings.terms.dense_flow else self._priors.tracker
@@ -123,7 +125,7 @@ class Slam:
             inverse_depth=np.concatenate([one.keyframes.depths() for one in maps]),
             static=np.concatenate([one.keyframes.statics() for one in maps]),
             working=size,
-            camera=Camera.from_index_params("pinhole", maps[main].keyframes.intrinsics, size.width, size.height),
+            camera=maps[main].keyframes.camera,
             motion=maps[main].motion,
             focal_sigma_ratio=maps[main].focal_sigma_ratio,
             map=combine([one.found for one in maps]),
@@ -157,7 +159,7 @@ class Slam:
             done += shot.stop - shot.start
             if number == main:
                 intrinsics = maps[main].keyframes.intrinsics
-                prior = FocalPrior(math.log(float(intrinsics[0])), _SAME_FOCAL_SIGMA)
+                prior = FocalPrior(math.log(float(intrinsics[0])), _SAME_FOCAL_SIGMA, same_lens=True)
         report("backend", 1, 1)
         return [maps[number] for number in range(len(maps))]
 
@@ -170,7 +172,8 @@ class Slam:
         scale_x, scale_y = size.width / source.info.width, size.height / source.info.height
         focal_px = estimate.camera.focal_px / math.sqrt(scale_x * scale_y)
         width, height = source.info.width, source.info.height
-        square = Camera("pinhole", (focal_px, focal_px, width / 2, height / 2), width, height)
+        shape = estimate.camera.params[4:]
+        square = Camera(estimate.camera.model, (focal_px, focal_px, width / 2, height / 2, *shape), width, height)
         camera = square.resized(size.width, size.height)
         scale = camera.focal_px / estimate.camera.focal_px
         rivals_px = tuple(rival_px * scale for rival_px in estimate.rivals_px)

@@ -9,7 +9,7 @@ from vipe_core.evaluation.synthetic.clip import (
     sample_camera,
     tiny_clip,
 )
-from vipe_core.evaluation.synthetic.render import RenderedFrame, depth_kind_of, render_frames
+from vipe_core.evaluation.synthetic.render import RenderedFrame, render_frames
 from vipe_core.evaluation.synthetic.scene import Light, Material, Motion, Primitive, Scene, box, room, sphere
 from vipe_core.evaluation.synthetic.scenes import courtyard_scene, moving_ball_scene, room_scene
 
@@ -25,7 +25,6 @@ __all__ = [
     "SyntheticClip",
     "box",
     "courtyard_scene",
-    "depth_kind_of",
     "moving_ball_scene",
     "render_clip",
     "render_frames",

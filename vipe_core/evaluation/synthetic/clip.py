@@ -9,11 +9,11 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from vipe_core.annotation import DepthKind
+from vipe_core.annotation import DepthKind, depth_kind_of
 from vipe_core.cameras import Camera, CameraModel
 from vipe_core.errors import ConfigError
 from vipe_core.evaluation.synthetic.paths import arc, handheld, look_at, through
-from vipe_core.evaluation.synthetic.render import depth_kind_of, render_frames
+from vipe_core.evaluation.synthetic.render import render_frames
 from vipe_core.evaluation.synthetic.scene import Scene
 from vipe_core.evaluation.synthetic.scenes import moving_ball_scene, room_scene
 

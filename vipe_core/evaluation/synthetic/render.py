@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from vipe_core.annotation import DepthKind
+from vipe_core.annotation import depth_kind_of
 from vipe_core.cameras import Camera
 from vipe_core.evaluation.synthetic.cast import cast, tile_candidates
 from vipe_core.evaluation.synthetic.rays import RayGrid, unit_rays
@@ -43,11 +43,6 @@ class _Hits:
     distance: NDArray[np.float64]
     surface: NDArray[np.int32]
     rgb: NDArray[np.float32]
-
-
-def depth_kind_of(camera: Camera) -> DepthKind:
-    """`z` for pinhole; `ray` for the models that see sideways, where z would be zero or negative."""
-    return "z" if camera.model == "pinhole" else "ray"
 
 
 def render_frames(

@@ -9,8 +9,9 @@ from vipe_core.priors.classical.focal import FocalVote, TwoViewFocal
 from vipe_core.priors.classical.patches import PatchAligner
 from vipe_core.priors.classical.sift import SiftMatcher
 from vipe_core.priors.classical.tracks import LkTracker
+from vipe_core.priors.classical.unified import UnifiedInit
 from vipe_core.priors.classical.vanishing import VanishingFocal
-from vipe_core.priors.protocols import PriorFamily
+from vipe_core.priors.protocols import IntrinsicsInit, PriorFamily
 
 __all__ = [
     "CombinedFocalInit",
@@ -22,20 +23,26 @@ __all__ = [
     "PatchAligner",
     "SiftMatcher",
     "TwoViewFocal",
+    "UnifiedInit",
     "VanishingFocal",
     "classical_priors",
 ]
 
 
-def classical_priors() -> PriorFamily:
+def classical_priors(camera: str = "pinhole") -> PriorFamily:
     """DIS flow, Lucas-Kanade tracks and patches, SIFT correspondences, focal length from pairs and from lines.
 
     Make one per thread. The number of OpenCV threads is the caller's choice.
+
+    Args:
+        camera: `pinhole`, `mei`, or `auto` for what the video says.
     """
+    initialisers: dict[str, IntrinsicsInit] = {"pinhole": CombinedFocalInit((TwoViewFocal(), VanishingFocal()))}
+    initialisers["mei"], initialisers["auto"] = UnifiedInit(), UnifiedInit(initialisers["pinhole"])
     return PriorFamily(
         matcher=DisFlowMatcher(),
         tracker=LkTracker(),
         points=SiftMatcher(),
-        intrinsics=CombinedFocalInit((TwoViewFocal(), VanishingFocal())),
+        intrinsics=initialisers[camera],
         aligner=PatchAligner(),
     )
