@@ -110,7 +110,7 @@ def test_a_job_from_s3_to_s3_survives_kill_9(
 
     done = vipectl("verify", f"s3://{bucket}/run-1", "--s3-endpoint", s3_endpoint)
     assert done.returncode == 0, done.stderr
-    assert "5 videos = 4 succeeded + 1 failed" in done.stdout
+    assert "5 videos of 5 planned = 4 succeeded + 1 failed + 0 quarantined" in done.stdout
     done = vipectl("export", f"s3://{bucket}/run-1", "npz", "--format", "npz", "--s3-endpoint", s3_endpoint)
     assert done.returncode == 0, done.stderr
     exported = sorted((tmp_path / "npz").glob("*.npz"))
