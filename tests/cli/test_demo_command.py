@@ -20,7 +20,7 @@ def test_the_users_video_all_the_way(vipectl: Run, clip: Path, tmp_path: Path, m
     monkeypatch.setenv("VIPE_API_KEY", "secret")
     done = vipectl("demo", clip, "-o", "out")
     assert done.returncode == 0, done.stdout + done.stderr
-    assert "1 videos = 1 succeeded + 0 failed" in done.stdout
+    assert "1 videos of 1 planned = 1 succeeded + 0 failed" in done.stdout
     assert "sideways-" in done.stdout
     assert "vipectl verify out/dataset --deep" in done.stdout
     (picture,) = (tmp_path / "out/pictures").glob("*.png")
