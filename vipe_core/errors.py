@@ -9,6 +9,7 @@
     │   ├── UnsupportedMedia      media_unsupported
     │   ├── MediaTooLarge         media_too_large
     │   ├── MaskMismatch          mask_mismatch       given masks do not belong to the pictures
+    │   ├── CalibrationMismatch   calibration_mismatch  the given calibration is not of the pictures
     │   └── ScaleUnobservable     scale_unobservable  the known length cannot be found in the video
     ├── DecodeError           the decoder child is the cause
     │   ├── DecodeTimeout         decode_timeout      (retryable)
@@ -88,6 +89,12 @@ class MaskMismatch(InputError):
     """Masks were given that are not one per picture, or not of the pictures' size."""
 
     code = "mask_mismatch"
+
+
+class CalibrationMismatch(InputError):
+    """A calibration was given that cannot be of pictures of this size."""
+
+    code = "calibration_mismatch"
 
 
 class ScaleUnobservable(InputError):

@@ -15,17 +15,18 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from vipe_core.cameras import distortion
 from vipe_core.errors import ConfigError
 
 if TYPE_CHECKING:
     from torch import Tensor
 
-CameraModel = Literal["pinhole", "mei", "equirect"]
+CameraModel = Literal["pinhole", "mei", "equirect", "opencv", "opencv_fisheye"]
 
 # How compiled code tells the models apart.
-MODEL_CODE: dict[CameraModel, int] = {"pinhole": 0, "mei": 1, "equirect": 2}
+MODEL_CODE: dict[CameraModel, int] = {"pinhole": 0, "mei": 1, "equirect": 2, "opencv": 3, "opencv_fisheye": 4}
 
-_NUM_PARAMS: dict[str, int] = {"pinhole": 4, "mei": 5, "equirect": 0}
+_NUM_PARAMS: dict[str, int] = {"pinhole": 4, "mei": 5, "equirect": 0, "opencv": 12, "opencv_fisheye": 8}
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,8 +34,10 @@ class Camera:
     """A camera model with its parameters.
 
     Attributes:
-        model: `pinhole`, `mei` (the unified model) or `equirect`.
-        params: `pinhole` (fx, fy, cx, cy); `mei` (fx, fy, cx, cy, alpha); `equirect` (). Pixels, half-pixel centres.
+        model: `pinhole`, `mei` (the unified model), `equirect`, or one of a lens with measured distortion, `opencv` or
+            `opencv_fisheye` (`distortion`), which is known and not estimated.
+        params: `pinhole` (fx, fy, cx, cy); `mei` (fx, fy, cx, cy, alpha); `equirect` (); `opencv` (fx, fy, cx, cy, k1,
+            k2, p1, p2, k3, k4, k5, k6); `opencv_fisheye` (fx, fy, cx, cy, k1, k2, k3, k4). Pixels, half-pixel centres.
         width: Image width that `params` belong to, pixels.
         height: Image height, pixels.
 
@@ -69,13 +72,26 @@ class Camera:
 
     @property
     def fov_x_deg(self) -> float:
-        """Angle between the left and right edge rays through the centre row, degrees."""
+        """Angle between the left and right edge rays through the row of the principal point, degrees."""
         if self.model == "equirect":
             return 360.0
+        fx, cx = self.params[0], self.params[2]
+        return math.degrees(self._angle(cx / fx) + self._angle((self.width - cx) / fx))
+
+    def _angle(self, m: float) -> float:
+        """Angle from the axis at a distance m from the principal point along x, in focal lengths."""
+        if self.distorted:
+            fx, _, cx, cy = self.index_params()[:4]
+            x, _, z = self.unproject((cx + m * fx, cy))
+            return math.atan2(float(x), float(z))
         alpha = self.params[4] if self.model == "mei" else 0.0
-        m = self.width / 2 / self.params[0]
         eta = (alpha + math.sqrt(max(0.0, 1 + (1 - alpha * alpha) * m * m))) / (1 + m * m)
-        return math.degrees(2 * math.atan2(eta * m, eta - alpha))
+        return math.atan2(eta * m, eta - alpha)
+
+    @property
+    def distorted(self) -> bool:
+        """Whether this is a lens with measured distortion, whose pictures bundle adjustment sees resampled."""
+        return self.model in ("opencv", "opencv_fisheye")
 
     def index_params(self) -> NDArray[np.float64]:
         """What `projection` takes, float64, for integer pixel indices.
@@ -99,7 +115,9 @@ class Camera:
         return cls(model, tuple(values), width, height)
 
     def unproject(self, px: ArrayLike) -> NDArray[np.float64]:
-        """(..., 2) index coordinates -> (..., 3) float64 rays: z = 1 for `pinhole`, unit length otherwise."""
+        """(..., 2) index coordinates -> (..., 3) float64 rays: z = 1 for `pinhole` and `opencv`, else unit length."""
+        if self.distorted:
+            return distortion.unproject(self.model, self.index_params(), np.array(px, dtype=np.float64))[0]
         from vipe_core.cameras import projection  # here, so that a camera without pixels needs no torch
 
         pixels = np.array(px, dtype=np.float64)
@@ -109,13 +127,25 @@ class Camera:
     def project(self, points: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
         """(..., 3) points in the camera frame -> (..., 2) float64 index coordinates, (...) whether they are imaged.
 
-        A pixel outside of the image is valid; one behind a pinhole camera is not.
+        A pixel outside of the image is valid; one behind a pinhole camera is not, nor one beyond a measured distortion.
         """
+        if self.distorted:
+            return distortion.project(self.model, self.index_params(), np.array(points, dtype=np.float64))
         from vipe_core.cameras import projection
 
         xyz = np.array(points, dtype=np.float64)
         px, valid = projection.project(self.model, self._tensor(self.index_params()), self._tensor(xyz))
         return np.asarray(px.numpy()), np.asarray(valid.numpy())
+
+    def has_ray(self, px: ArrayLike) -> NDArray[np.bool_]:
+        """(..., 2) index coordinates -> (...) whether the model images anything there."""
+        pixels = np.array(px, dtype=np.float64)
+        if self.distorted:
+            return distortion.unproject(self.model, self.index_params(), pixels)[1]
+        from vipe_core.cameras import projection
+
+        found = projection.on_image_disk(self.model, self._tensor(self.index_params()), self._tensor(pixels))
+        return np.asarray(found.numpy())
 
     def rays(self, height: int | None = None, width: int | None = None) -> NDArray[np.float64]:
         """(height, width, 3) float64 rays of all pixels of the image resized to that size (default: its own size)."""

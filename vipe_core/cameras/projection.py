@@ -25,6 +25,7 @@ import torch
 from torch import Tensor
 
 from vipe_core.cameras.camera import CameraModel
+from vipe_core.errors import ConfigError
 
 # The squared root g of the unified model at which a pixel of a camera with alpha > 1 is taken to be off its image disk.
 _MIN_DISK = 1e-6
@@ -35,6 +36,14 @@ _MIN_SLOPE = 1e-9
 def num_free_intrinsics(model: CameraModel) -> int:
     """How many intrinsics have derivatives: log f, and alpha for `mei`."""
     return {"pinhole": 1, "mei": 2, "equirect": 0}[model]
+
+
+def _require_derivable(model: CameraModel) -> None:
+    """Raises:
+    ConfigError: A lens with measured distortion, which only `Camera` projects with.
+    """
+    if model in ("opencv", "opencv_fisheye"):
+        raise ConfigError(f"pictures of a camera {model!r} must be resampled before they are adjusted")
 
 
 def unproject(model: CameraModel, params: Tensor, px: Tensor) -> Tensor:
@@ -48,6 +57,7 @@ def unproject(model: CameraModel, params: Tensor, px: Tensor) -> Tensor:
     Returns:
         (..., 3) rays in the camera frame: z = 1 for `pinhole`, unit length otherwise.
     """
+    _require_derivable(model)
     u, v = px.unbind(-1)
     if model == "equirect":
         theta = ((u + 0.5) / params[0] - 0.5) * (2 * math.pi)
@@ -122,6 +132,7 @@ def project(model: CameraModel, params: Tensor, points: Tensor) -> tuple[Tensor,
         px (..., 2) index coordinates, finite everywhere, and valid (...) bool: the model images this direction. Pixels
         outside of the image are valid.
     """
+    _require_derivable(model)
     x, y, z = points.unbind(-1)
     if model == "equirect":
         norm = points.norm(dim=-1)
