@@ -9,7 +9,7 @@ Coordinated caps keep one bad part from taking the rest with it. A video that ki
 quarantined after `max_worker_deaths`, or after fewer in different places. A slot on which workers die in a row
 is itself the suspect and is fenced before it can quarantine the innocent. Where a slot has seen nothing but the deaths
 of one video, it cannot tell which of the two is bad: before its last try the shard is given back, so that another slot
-may say.
+may say. A slot that begins anew, after a fence too, condemns nobody before it has done other work or tried for itself.
 """
 
 from __future__ import annotations
@@ -119,6 +119,8 @@ class Supervisor:
         self._sleep = sleep
         self._alive = False
         self._suspicious: list[str] = []
+        self._proved = False
+        self._tried: set[str] = set()
         self._born_s = 0.0
         self._videos = 0
         self._grown_from_bytes = 0
@@ -165,6 +167,8 @@ class Supervisor:
     def pardon(self) -> None:
         """Give a fenced slot another chance."""
         self._suspicious.clear()
+        self._proved = False
+        self._tried.clear()
 
     # The shard ------------------------------------------------------------------------------------------------------
 
@@ -222,10 +226,10 @@ class Supervisor:
                 match answer:
                     case Annotated(result):
                         results[video.key] = result
-                        self._suspicious.clear()
+                        self._trust()
                         storage.succeeded()
                     case Failed(scope="video"):
-                        self._suspicious.clear()
+                        self._trust()
                         tries[video.key] = tries.get(video.key, 0) + 1
                         if answer.detail:
                             logger.error("%s\n%s", answer.message, answer.detail)
@@ -233,7 +237,7 @@ class Supervisor:
                             logger.info("failed with %s: %s", answer.code, answer.message)
                             results[video.key] = failed_row(video, lease.attempt, answer.code, answer.message)
                     case Failed(scope="storage"):
-                        self._suspicious.clear()
+                        self._trust()
                         delay_s = storage.failed()
                         if answer.retryable and storage.failures < self._config.storage_tries:
                             logger.warning("storage failed, next try in %.1f s: %s", delay_s, answer.message)
@@ -363,6 +367,7 @@ class Supervisor:
         if died.preempted:
             logger.warning("the machine of a worker was taken away; its video is not blamed: %s", died.detail)
             return
+        self._tried.add(video.key)
         before = deaths.get(video.key, ())
         first = not before
         lease = live.lease
@@ -387,14 +392,20 @@ class Supervisor:
             return at_least
         return counted if len(counted) >= len(at_least) else at_least
 
+    def _trust(self) -> None:
+        """The worker came through a task: whatever died here before, it was not for the slot's sake alone."""
+        self._suspicious.clear()
+        self._proved = True
+
     def _is_poison(self, key: str, deaths: tuple[Death, ...]) -> bool:
         """Dead in two places, it is the video and not the place. In one place it takes more deaths, and a slot that
-        was there and has done other work since: one that sees it for the first time tries."""
+        was there and has done other work since, or has tried for itself since it began anew."""
         places = {death.place for death in deaths if death.place}
         if len(places) >= self._config.max_death_places:
             return True
         seen_here = not places or self._handle.place in places
-        return len(deaths) >= self._config.max_worker_deaths and seen_here and key not in self._suspicious
+        may_say = key not in self._suspicious and (self._proved or key in self._tried)
+        return len(deaths) >= self._config.max_worker_deaths and seen_here and may_say
 
     def _worn_out(self) -> bool:
         """Whether the worker process has done enough: leaks of drivers and decoders end with it."""

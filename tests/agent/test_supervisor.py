@@ -127,6 +127,29 @@ def test_a_fenced_slot_that_is_pardoned_ends_the_job_after_all(rig: Rig) -> None
     assert {row.status for row in rig.rows(live).values()} == {VideoStatus.QUARANTINED}
 
 
+def test_a_pardoned_slot_tries_a_video_before_it_condemns_it(rig: Rig) -> None:
+    """Its deaths, however many, were all on a slot that did nothing else meanwhile: it may have been the slot."""
+    rig.job({"innocent": "die"})
+    assert rig.supervisor.work(rig.lease()).kind == "given_back"
+    assert rig.supervisor.work(rig.lease()).fenced
+    (rig.root / "inputs" / "innocent.mp4").write_text("frames=3")  # What was wrong with the slot is over.
+    rig.supervisor.pardon()
+    live = rig.lease()
+    assert rig.supervisor.work(live).kind == "committed"
+    assert rig.rows(live)["innocent"].status is VideoStatus.SUCCEEDED
+
+
+def test_a_lone_poison_on_a_lone_slot_is_quarantined_after_the_pardon(rig: Rig) -> None:
+    rig.job({"poison": "die"})
+    assert rig.supervisor.work(rig.lease()).kind == "given_back"
+    assert rig.supervisor.work(rig.lease()).fenced
+    rig.supervisor.pardon()
+    live = rig.lease()
+    assert rig.supervisor.work(live).kind == "committed"
+    assert rig.rows(live)["poison"].status is VideoStatus.QUARANTINED
+    assert rig.slot.annotated() == ["poison"] * 4
+
+
 def test_a_process_that_died_while_idle_is_nobodys_fault(rig: Rig) -> None:
     rig.job({"a": "frames=3"})
     assert rig.supervisor.start()

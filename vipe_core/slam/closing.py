@@ -103,7 +103,7 @@ class LoopCloser:
     def _candidates(self) -> list[tuple[int, int]]:
         """Each keyframe's most similar far one before it, the most similar pairs first."""
         count = len(self._keyframes)
-        alike = similarity([self._measured.overview(k) for k in range(count)])
+        alike = similarity(count, self._measured.overview)
         found = []
         for new in range(count):
             hops = self._hops(new, _NEAR_HOPS)

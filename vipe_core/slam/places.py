@@ -6,7 +6,7 @@ The vocabulary is made from the video itself, so nothing has to be trained or sh
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,19 +17,27 @@ _TRAINING = 8000
 _SEED = 0
 
 
-def similarity(descriptors: Sequence[NDArray[np.float32]]) -> NDArray[np.float32]:
-    """(K, K) cosine of the looks of K frames, from the (n_k, D) unit descriptors of each. A blank frame has zeros."""
-    count = len(descriptors)
-    everything = np.concatenate(list(descriptors)) if count else np.zeros((0, 1), np.float32)
-    if len(everything) < _WORDS:
+def similarity(count: int, descriptors: Callable[[int], NDArray[np.float32]]) -> NDArray[np.float32]:
+    """(K, K) cosine of the looks of `count` frames. A blank frame has zeros.
+
+    Args:
+        descriptors: Frame number -> its (n, D) unit descriptors. Asked for one frame at a time, and again: those of a
+            long video would take more memory than its map.
+    """
+    ends = np.cumsum([len(descriptors(k)) for k in range(count)], dtype=np.int64)
+    total = int(ends[-1]) if count else 0
+    if total < _WORDS:
         return np.zeros((count, count), np.float32)
-    chosen = np.linspace(0, len(everything) - 1, min(len(everything), _TRAINING)).astype(np.int64)
+    chosen = np.linspace(0, total - 1, min(total, _TRAINING)).astype(np.int64)
+    owner = np.searchsorted(ends, chosen, side="right")
+    # Counted from the end, a descriptor has its number within its frame.
+    training = np.concatenate([descriptors(k)[chosen[owner == k] - ends[k]] for k in np.unique(owner)])
     with warnings.catch_warnings():
         # A word that no descriptor is nearest to, where many are the same: it stays what it was, and counts nothing.
         warnings.filterwarnings("ignore", "One of the clusters is empty")
-        words, _ = kmeans2(everything[chosen].astype(np.float64), _WORDS, iter=8, minit="points", rng=_SEED)
+        words, _ = kmeans2(training.astype(np.float64), _WORDS, iter=8, minit="points", rng=_SEED)
     words = words.astype(np.float32)
-    looks = np.stack([_vlad(found, words) for found in descriptors])
+    looks = np.stack([_vlad(descriptors(k), words) for k in range(count)])
     # What all frames of the video have in common tells no places apart.
     looks -= looks.mean(axis=0)
     looks /= np.maximum(np.linalg.norm(looks, axis=1, keepdims=True), 1e-6)
