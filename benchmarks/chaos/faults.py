@@ -53,6 +53,8 @@ KINDS = (
 )
 
 
+# How long a fault waits for work to break into.
+_WAIT_S = 180.0
 # Of the requests that a mode of the proxy befalls.
 _SHARES = {"down": 1.0, "lost": 0.3, "truncated": 0.5, "slow": 1.0}
 
@@ -99,9 +101,9 @@ class Injector:
         match kind.name:
             case "worker-sigkill" | "worker-sigstop":
                 number = signal.SIGKILL if kind.name == "worker-sigkill" else signal.SIGSTOP
-                self._strike(fault, number, lambda: world.worker(fault.agent))
+                self._strike(fault, number, world.worker)
             case "decoder-sigstop":
-                self._strike(fault, signal.SIGSTOP, lambda: world.decoder(fault.agent))
+                self._strike(fault, signal.SIGSTOP, world.decoder)
             case "ray-head-sigkill":
                 for process in world.head(fault.agent):
                     _kill(process.pid, signal.SIGKILL)
@@ -127,12 +129,17 @@ class Injector:
                 fault.happened = True
         fault.over = fault.over or fault.at
 
-    def _strike(self, fault: Injected, number: int, find: Callable[[], Process | None]) -> None:
-        """Hit a process while it works on a video that nothing has happened to, so that it is not blamed twice."""
-        deadline = time.monotonic() + 90
-        while time.monotonic() < deadline:
+    def _strike(self, fault: Injected, number: int, find: Callable[[str], Process | None]) -> None:
+        """Hit a process while it works on a video that nothing has happened to, so that it is not blamed twice.
+
+        Where the agent that was meant has no work for long, for whatever else happened to it, the other is hit.
+        """
+        began = time.monotonic()
+        while (waited_s := time.monotonic() - began) < _WAIT_S:
+            if waited_s > _WAIT_S / 4:
+                fault.agent = AGENTS[int(waited_s / 5) % len(AGENTS)]
             video = running_video(self.world, fault.agent)
-            process = find()
+            process = find(fault.agent)
             if video is not None and video not in self.victims and not video.startswith("poison") and process:
                 self.victims.add(video)
                 fault.video, fault.at, fault.happened = video, time.time(), True

@@ -77,12 +77,21 @@ def test_alerts_and_totals_hold_where_series_are_missing_or_start_again() -> Non
         "no agent, no series: that is no progress either"
     )
     assert "vipe_frames_in_progress" in stalled, "a long shard settles no video for hours"
+    assert "vipe_shards" not in stalled, "a paused job leaves shards pending for as long as it likes"
     counters = {name for name in exported_series() if name.startswith("vipe_") and name.endswith("_total")}
     for expr in expressions():
         for name in counters & set(re.findall(r"\bvipe_[a-z_]+", expr)):
             bare = re.findall(rf"(\w+)\({name}(?:{{[^}}]*}})?(\[)?", expr)
             assert bare, expr
             assert all(call in ("rate", "increase") and window for call, window in bare), expr
+
+
+def test_the_dashboard_shows_every_metric() -> None:
+    shown = {name for expr in expressions() for name in re.findall(r"\bvipe_[a-z_]+", expr)}
+    named = {name.removesuffix("_bucket").removesuffix("_sum") for name in shown}
+    families = {family.name for family in Metrics().registry.collect() if family.name.startswith("vipe_")}
+    missing = {name for name in families if name not in named and f"{name}_total" not in named}
+    assert missing == {"vipe_build_info"}
 
 
 def test_dashboard_labels_exist() -> None:
