@@ -15,6 +15,8 @@
     │   ├── DecodeTimeout         decode_timeout      (retryable)
     │   └── DecodeCrashed         decode_crashed      (retryable)
     ├── ConfigError           invalid_config          a preset, camera or device that does not exist
+    │   ├── WeightsMissing        weights_missing     a preset's network weights are not on this machine
+    │   └── WeightsInvalid        weights_invalid     a file of weights is not what it should be
     ├── FormatError           format_error            an artifact on disk does not hold what it must
     │   └── ExportUnsupported     export_unsupported  a format cannot hold this sequence
     └── EngineError           engine_failed           a stage could not finish; always a defect of ours
@@ -122,6 +124,18 @@ class DecodeCrashed(DecodeError):
 
 class ConfigError(VipeError):
     code = "invalid_config"
+
+
+class WeightsMissing(ConfigError):
+    """The network weights that a preset needs are not on this machine; the message names the command that gets them."""
+
+    code = "weights_missing"
+
+
+class WeightsInvalid(ConfigError):
+    """A file of weights is damaged, has another checksum, or holds other tensors than the network has."""
+
+    code = "weights_invalid"
 
 
 class FormatError(VipeError):

@@ -7,10 +7,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
+from torch import Tensor
 
 from vipe_core.annotation import DepthKind
 from vipe_core.ba.problem import Grid
@@ -76,6 +77,87 @@ class DenseMatcher(Protocol):
 
     def match_fast(self, source: Any, target: Any, guess_px: Array | None = None) -> Match:
         """Cheaper one-way measurement for posing frames between keyframes."""
+
+
+@runtime_checkable
+class BatchEncoder(Protocol):
+    """A matcher whose features are cheaper for several frames at once.
+
+    Attributes:
+        batch_frames: How many are best given together.
+        bytes_per_px: Memory that the features of a frame hold, for each pixel of it.
+    """
+
+    batch_frames: int
+    bytes_per_px: float
+
+    def encode_batch(self, frames: Sequence[WorkingFrame]) -> list[Any]:
+        """What `DenseMatcher.encode` gives for each frame."""
+
+
+@dataclass(frozen=True, slots=True)
+class Refined:
+    """What one update of a refinement says. All tensors are on its device, and float32.
+
+    Attributes:
+        target_px: (E, P, 2) where the source cells of each edge are seen in the target.
+        weight: (E, P, 2) inverse variance in 1/px^2 per component; 0 on cells that must not be used.
+        damping: (S, P) information on the inverse depth of each source frame (in increasing order of their numbers), of
+            staying where it is: px^-2 per (inverse depth as a share of the map's median)^2 as in `weight`.
+    """
+
+    target_px: Tensor
+    weight: Tensor
+    damping: Tensor
+
+
+class Refinement(Protocol):
+    """Directed edges between frames whose measurements are improved together with the geometry (paper section 3.2.1).
+
+    Every edge has a state that remembers what was said of it. An update is asked where the geometry sees the cells; the
+    geometry is then adjusted to the answer, and so on in turns.
+    """
+
+    def __len__(self) -> int:
+        """Number of edges."""
+
+    def add(self, pairs: Sequence[tuple[Any, Any]], seen_px: Tensor) -> None:
+        """Append edges.
+
+        Args:
+            pairs: Features of `DenseMatcher.encode` of the source and the target of each.
+            seen_px: (E, P, 2) where the geometry sees the source cells in the target.
+        """
+
+    def keep(self, rows: Sequence[int]) -> None:
+        """Forget all edges but those of these rows."""
+
+    def update(self, seen_px: Tensor, sources: Sequence[int]) -> Refined:
+        """Improve all edges.
+
+        Args:
+            seen_px: (E, P, 2) where the geometry sees the source cells now, anything where it does not.
+            sources: Number of the source frame of each edge: edges out of one frame inform each other.
+        """
+
+
+class Refiner(Protocol):
+    """Measurements that are refined in turns with bundle adjustment, as a recurrent network does.
+
+    Attributes:
+        offset_px: Where in a cell its sample point is; see `Grid.offset`.
+    """
+
+    @property
+    def offset_px(self) -> float: ...
+
+    def begin(self, grid: Grid, *, lean: bool) -> Refinement:
+        """A refinement without edges.
+
+        Args:
+            grid: Cells of the frames.
+            lean: Rather slower than with memory that grows with the edges by more than their states: for whole graphs.
+        """
 
 
 class SparseTracker(Protocol):
@@ -168,6 +250,8 @@ class PriorFamily:
         points: Correspondences across wide steps, or None for a family whose dense matching needs none.
         intrinsics: Initial camera.
         aligner: Measurements near the finished geometry, or None for a family whose dense matching is as good.
+        refiner: Measurements refined in turns with the geometry, which then replaces pairwise matching in the map; None
+            for a family that measures each pair once.
     """
 
     matcher: DenseMatcher
@@ -175,6 +259,7 @@ class PriorFamily:
     points: PointMatcher | None
     intrinsics: IntrinsicsInit
     aligner: Aligner | None = None
+    refiner: Refiner | None = None
 
 
 class VideoDepth(Protocol):
