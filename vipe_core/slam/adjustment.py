@@ -198,7 +198,7 @@ class Adjuster:
                 log_focal_sigma=self.focal_prior.sigma / self.settings.focal_sigma_inflation,
             ),
         )
-        return problem, self._state(poses, depths, keyframes.intrinsics)
+        return problem, self.state(poses, depths, keyframes.intrinsics)
 
     def anneal(self, problem: Problem, state: State, schedule: Sequence[Step]) -> Result | None:
         """Solve with each kernel of the schedule in turn; None when the very first solve fails."""
@@ -225,7 +225,8 @@ class Adjuster:
             result = solved
         return result
 
-    def _state(self, poses: Array, depths: Array, intrinsics: Array) -> State:
+    def state(self, poses: Array, depths: Array, intrinsics: Array) -> State:
+        """Poses (N, 4, 4), inverse depths (N, P) and intrinsics on the device."""
         return State(
             cam_from_world=torch.from_numpy(np.ascontiguousarray(poses)).to(self.device),
             inverse_depth=torch.from_numpy(np.ascontiguousarray(depths)).to(self.device),

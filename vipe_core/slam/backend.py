@@ -14,7 +14,7 @@ from vipe_core.ba.problem import Result
 from vipe_core.slam.adjustment import REFINE, SETTLE, Adjuster, Step
 from vipe_core.slam.centring import refine_principal_point
 from vipe_core.slam.closing import LoopCloser
-from vipe_core.slam.lens import focal_sigma_ratio
+from vipe_core.slam.lens import focal_sigma_ratio, plausible
 from vipe_core.slam.masks import MotionMasks
 from vipe_core.slam.measuring import MeasuredGraph
 from vipe_core.slam.proximity import close_pairs, loop_edges
@@ -25,8 +25,6 @@ logger = logging.getLogger(__name__)
 
 Array = NDArray[Any]
 
-_MIN_FOV_DEG = 12.0
-_MAX_FOV_DEG = {"pinhole": 150.0, "mei": 320.0}
 # Share of a keyframe's cells whose change of mask calls for another adjustment.
 _VISIBLE_CHANGE = 0.02
 _SUBSAMPLE = 4
@@ -146,11 +144,10 @@ class Backend:
         camera = self._keyframes.camera
         formal = focal_sigma_ratio(camera, result.intrinsics_covariance)
         sigma = math.hypot(self._settings.focal_sigma_inflation * formal, self._settings.lens_sigma)
-        fov_deg = camera.fov_x_deg
-        if math.isfinite(sigma) and _MIN_FOV_DEG < fov_deg < _MAX_FOV_DEG[camera.model]:
+        if math.isfinite(sigma) and plausible(camera):
             self.focal_sigma_ratio = sigma
             return result
-        logger.info("focal length held: it went to a field of view of %.1f deg, sigma %.3f", fov_deg, sigma)
+        logger.info("focal length held: it went to a field of view of %.1f deg, sigma %.3f", camera.fov_x_deg, sigma)
         self.focal_sigma_ratio = self._adjuster.focal_prior.sigma
         self._keyframes.restore(before)
         return self._adjust_everything(schedule, free_focal=False)

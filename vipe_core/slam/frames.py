@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Generator
+from collections.abc import Generator, Iterable, Iterator
 from contextlib import closing
+from itertools import islice
 from typing import Any
 
 from vipe_core.errors import EmptyMedia
-from vipe_core.priors.protocols import DenseMatcher, WorkingFrame
+from vipe_core.priors.protocols import BatchEncoder, DenseMatcher, WorkingFrame
 from vipe_core.slam.working import WorkingSize, working_frame
-from vipe_core.video.source import FrameSource
+from vipe_core.video.source import Frame, FrameSource
 
 # A gray picture with what is computed from it, and which pixels of it are usable where not all are; bytes per pixel.
 _BYTES_PER_PX = 1.5
@@ -33,6 +34,7 @@ class EncodedFrames:
         self._size = size
         self.matcher = matcher
         self.total_hint = source.info.num_frames_hint
+        self._bytes_per_px = matcher.bytes_per_px if isinstance(matcher, BatchEncoder) else _BYTES_PER_PX
         self._free_px_bytes = cache_bytes / (size.width * size.height)
         self._kept: list[Any] = []
         self.times_s: list[float] = []
@@ -53,15 +55,13 @@ class EncodedFrames:
             InputError, DecodeError: From the source.
         """
         with closing(self._source.frames(self._size.size)) as frames:
-            for frame in frames:
-                work = working_frame(frame)
-                features = self.matcher.encode(work)
+            for time_s, work, features in self._encoded(frames):
                 if self.cached:
                     self._kept.append(features)
-                self._free_px_bytes -= _BYTES_PER_PX + (0 if work.valid is None else _MASK_BYTES_PER_PX)
+                self._free_px_bytes -= self._bytes_per_px + (0 if work.valid is None else _MASK_BYTES_PER_PX)
                 if self._free_px_bytes < 0:
                     self._kept = []
-                self.times_s.append(frame.timestamp_s)
+                self.times_s.append(time_s)
                 yield work, features
         if not self.times_s:
             raise EmptyMedia(f"{self._source.info.name}: the video holds no frame; check the recording")
@@ -77,8 +77,23 @@ class EncodedFrames:
             yield from ((index, self._kept[index]) for index in range(start, stop))
             return
         with closing(self._source.frames(self._size.size, start=start, stop=stop)) as frames:
+            for _, work, features in self._encoded(frames):
+                yield work.index, features
+
+    def _encoded(self, frames: Iterable[Frame]) -> Iterator[tuple[float, WorkingFrame, Any]]:
+        """Time, working frame and features; read ahead by a batch where the matcher encodes several at once."""
+        several = self.matcher if isinstance(self.matcher, BatchEncoder) else None
+        if several is None or several.batch_frames < 2:
             for frame in frames:
-                yield frame.index, self.matcher.encode(working_frame(frame))
+                work = working_frame(frame)
+                yield frame.timestamp_s, work, self.matcher.encode(work)
+            return
+        reading = iter(frames)
+        while batch := list(islice(reading, several.batch_frames)):
+            work_batch = [working_frame(frame) for frame in batch]
+            found = several.encode_batch(work_batch)
+            for frame, work, features in zip(batch, work_batch, found, strict=True):
+                yield frame.timestamp_s, work, features
 
     def release(self) -> None:
         """Forget the pictures; nothing asks for them any more."""

@@ -14,12 +14,14 @@ from numpy.typing import NDArray
 
 from vipe_core.ba.problem import Edges, Free, Problem, State
 from vipe_core.geometry.arrays import interpolate_trajectory
-from vipe_core.priors.protocols import Aligner, DenseMatcher, Match, SparseTracker
+from vipe_core.priors.protocols import Aligner, DenseMatcher, Match, Refiner, SparseTracker
 from vipe_core.slam.adjustment import SETTLE, Step
 from vipe_core.slam.consensus import MAJORITY, consensus_pose
 from vipe_core.slam.frames import EncodedFrames
 from vipe_core.slam.graph import sharpen
 from vipe_core.slam.mapping import ShotMap
+from vipe_core.slam.recurrent.posing import FramePoser, Unposed
+from vipe_core.slam.recurrent.settings import RefinementSettings
 from vipe_core.slam.reprojection import Induced, Reprojector, relative_pose
 from vipe_core.slam.rotation import Link, RotationFitter
 from vipe_core.slam.segmentation import UNKNOWN, carried
@@ -61,6 +63,7 @@ class _Pending:
 
     Attributes:
         agreed: (P,) bool for each match, cells that may take part in the fit.
+        sources: Keyframes that it is to be measured from, where that has not been done.
     """
 
     index: int
@@ -68,6 +71,7 @@ class _Pending:
     start: NDArray[np.float64]
     matches: tuple[tuple[int, Match], ...]
     agreed: tuple[NDArray[np.bool_], ...]
+    sources: tuple[int, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,6 +92,7 @@ def fill_in(
     report: Report,
     aligner: Aligner | None = None,
     tracks_only: SparseTracker | None = None,
+    refined: tuple[Refiner, RefinementSettings] | None = None,
 ) -> Trajectory:
     """Pose every frame of the video against the finished map of its shot; holds one batch of measurements at a time.
 
@@ -97,6 +102,7 @@ def fill_in(
         batch: Frames that are posed together.
         aligner: Sharpens the measurements from the first fit, for a second one; None leaves it at one.
         tracks_only: Gives the measurements instead of dense flow, which then only guides it.
+        refined: Measurements are refined in turns with the poses, by this schedule; None measures each frame once.
 
     Raises:
         InputError, DecodeError: From the source.
@@ -112,7 +118,7 @@ def fill_in(
     )
     times_s = np.array(frames.times_s)
     shots = [
-        _ShotInfill(one, frames.matcher, reprojector, times_s, placed, trajectory, batch, aligner, tracks_only)
+        _ShotInfill(one, frames.matcher, reprojector, times_s, placed, trajectory, batch, aligner, tracks_only, refined)
         for one in maps
     ]
     waiting = [shot for shot in shots if shot.moves]
@@ -149,6 +155,7 @@ class _ShotInfill:
         batch: int,
         aligner: Aligner | None,
         tracks_only: SparseTracker | None,
+        refined: tuple[Refiner, RefinementSettings] | None,
     ) -> None:
         self.start, self.stop = shot_map.shot.start, shot_map.shot.stop
         self.moves = shot_map.motion != "static"
@@ -163,6 +170,10 @@ class _ShotInfill:
         self._batch = batch
         self._aligner = aligner
         self._tracks_only = tracks_only
+        self._poser: FramePoser | None = None
+        if refined is not None and self._fitter is None:
+            refiner, schedule = refined
+            self._poser = FramePoser(refiner, keyframes, shot_map.adjuster, shot_map.usable, schedule)
         self._pending: list[_Pending] = []
         frames = slice(self.start, self.stop)
         if not self.moves:
@@ -194,8 +205,11 @@ class _ShotInfill:
         pending, self._pending = self._pending, []
         if not pending:
             return
+        solved: NDArray[np.float64] | None
         if self._fitter is not None:
-            solved: NDArray[np.float64] | None = self._turned(pending, self._fitter)
+            solved = self._turned(pending, self._fitter)
+        elif self._poser is not None:
+            pending, solved = self._refined(pending, self._poser)
         else:
             solved = self._adjusted(pending, _SCHEDULE)
             if solved is not None and self._aligner is not None:
@@ -221,17 +235,34 @@ class _ShotInfill:
         nearest = {max(0, after - 1), min(after, len(self._keyframes) - 1)}
         if len(nearest) == 1 and len(self._keyframes) > 1:
             nearest.add(max(0, after - 2))
+        if self._poser is not None:
+            return _Pending(index, features, np.array(start), (), (), tuple(sorted(nearest)))
         matches = []
-        said = np.zeros(self._keyframes.grid.num_cells, dtype=np.float32)
         for k in sorted(nearest):
             guess_px = self._induced(k, start).target_px
             match = self._matcher.match_fast(self._keyframes.features[k], features, guess_px)
             if self._tracks_only is not None:
                 match = self._tracks_only.match(self._keyframes.features[k], features, match)
             matches.append((k, match))
+        self._label(index, matches)
+        return self._started(index, features, np.array(start), tuple(matches))
+
+    def _label(self, index: int, matches: Sequence[tuple[int, Match]]) -> None:
+        """What the cells of a frame do, by those of the keyframes that it is seen from."""
+        said = np.zeros(self._keyframes.grid.num_cells, dtype=np.float32)
+        for k, match in matches:
             said += carried(self._labels[k], match, self._keyframes.grid)
         self._into.labels[index] = np.sign(said)
-        return self._started(index, features, np.array(start), tuple(matches))
+
+    def _refined(self, pending: list[_Pending], poser: FramePoser) -> tuple[list[_Pending], NDArray[np.float64]]:
+        """The frames with what the refinement measured of them, and their poses."""
+        poses, measured = poser.run([Unposed(frame.features, frame.start, frame.sources) for frame in pending])
+        found = []
+        for frame, matches in zip(pending, measured, strict=True):
+            self._label(frame.index, matches)
+            usable = tuple(self._usable[k] for k, _ in matches)
+            found.append(_Pending(frame.index, frame.features, frame.start, matches, usable))
+        return found, poses
 
     def _started(
         self, index: int, features: Any, interpolated: NDArray[np.float64], matches: tuple[tuple[int, Match], ...]

@@ -58,6 +58,19 @@ class KeyframeMap:
         self._static.append(np.ones(self.grid.num_cells, dtype=np.bool_))
         return len(self) - 1
 
+    def remove(self, k: int) -> None:
+        """Forget keyframe `k`; the numbers of those behind it go down by one."""
+        kept: tuple[list[Any], ...] = (
+            self.frame_index,
+            self.times_s,
+            self.features,
+            self._poses,
+            self._depths,
+            self._static,
+        )
+        for each in kept:
+            del each[k]
+
     def pose(self, k: int) -> NDArray[np.float64]:
         return self._poses[k]
 

@@ -9,6 +9,13 @@ from vipe_core.ba.problem import Covariance
 from vipe_core.cameras import Camera
 
 _STEP = 1e-4
+_MIN_FOV_DEG = 12.0
+_MAX_FOV_DEG = {"pinhole": 150.0, "mei": 320.0}
+
+
+def plausible(camera: Camera) -> bool:
+    """Whether there are lenses with such a field of view."""
+    return _MIN_FOV_DEG < camera.fov_x_deg < _MAX_FOV_DEG[camera.model]
 
 
 def focal_sigma_ratio(camera: Camera, covariance: Covariance) -> float:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -22,10 +22,12 @@ from vipe_core.slam.graph import Graph
 from vipe_core.slam.keyframes import KeyframeMap
 from vipe_core.slam.masks import MotionMasks
 from vipe_core.slam.measuring import MeasuredGraph
+from vipe_core.slam.recurrent.backend import RefinedBackend
+from vipe_core.slam.recurrent.tracking import RefinedTracker
 from vipe_core.slam.reprojection import Reprojector
 from vipe_core.slam.rotation import Link, RotationFitter
 from vipe_core.slam.segmentation import UNKNOWN
-from vipe_core.slam.selection import Shot
+from vipe_core.slam.selection import Keyframe, Shot
 from vipe_core.slam.settings import SlamSettings
 from vipe_core.slam.timing import StageClock
 from vipe_core.slam.tracking import Tracker
@@ -71,6 +73,16 @@ class ShotMap:
     labels: NDArray[np.int8]
 
 
+@dataclass(frozen=True, slots=True)
+class _Bare:
+    """A map without a keyframe, and what it is built with."""
+
+    keyframes: KeyframeMap
+    graph: Graph
+    adjuster: Adjuster
+    masks: MotionMasks
+
+
 class ShotMapper:
     """Maps shots of one video, one after the other."""
 
@@ -112,46 +124,17 @@ class ShotMapper:
         scale_px = settings.scaled_px(1.0, size.width)
         keyframes, graph = KeyframeMap(size.grid, self._model, intrinsics), Graph()
         adjuster = Adjuster(settings, self._device, prior, scale_px)
-        measured = MeasuredGraph(
-            keyframes,
-            graph,
-            self._priors.matcher,
-            self._priors.tracker if settings.terms.sparse_tracks else None,
-            self._priors.points,
-            reprojector,
-            dense_flow=settings.terms.dense_flow,
-            aligner=self._priors.aligner,
-        )
         masks = MotionMasks(
             reprojector, keyframes, graph, adjuster.robust_scale_px, enabled=settings.terms.motion_masks
         )
-        backend = Backend(measured, adjuster, reprojector, masks, settings, size.width)
         static = shot.max_motion_px < settings.scaled_px(settings.static_motion_px, size.width)
         chosen = shot.keyframes[:1] if static else shot.keyframes
         times_s = [float(self._times_s[keyframe.index]) for keyframe in chosen]
-        tracker = Tracker(measured, adjuster, reprojector, masks, settings, scale_px)
-        with self._clock("track"):
-            first = min(len(chosen), settings.min_keyframes)
-            bootstrap = Bootstrap(measured, adjuster, reprojector, masks, settings.neighbours)
-            bootstrap.run(chosen[:first], times_s[:first])
-            for done in range(first, len(chosen) + 1):
-                if done > first:
-                    tracker.add(chosen[done - 1], times_s[done - 1])
-                if settings.backend_due(done) and done < len(chosen):
-                    backend.run()
-                tracked(chosen[done - 1].index + 1)
-        before = keyframes.snapshot()
-        with self._clock("backend"):
-            adjuster.alive = adjusting
-            adjusting()
-            backend.run()
-            adjuster.alive = lambda: None
-            loops = examine_loops(reprojector, keyframes, graph, before, settings.neighbours)
-            backend.recentre()
-            backend.sharpen()
+        build = self._measured if self._priors.refiner is None else self._refined
+        focal_sigma_ratio, loops = build(_Bare(keyframes, graph, adjuster, masks), chosen, times_s, tracked, adjusting)
         found = examine(reprojector, keyframes, graph, adjuster.robust_scale_px)
         motion: Motion = "static" if static else "general"
-        focal_sigma_ratio, fitter = backend.focal_sigma_ratio, None
+        fitter = None
         if not static and found.parallax_deg < _MAYBE_ROTATION_DEG:
             candidate = RotationFitter(self._model, size.grid, adjuster.robust_scale_px)
             with self._clock("rotation"):
@@ -167,6 +150,93 @@ class ShotMapper:
         return ShotMap(
             shot, keyframes, graph, motion, focal_sigma_ratio, found, loops, adjuster, fitter, usable, labels
         )
+
+    def _measured(
+        self,
+        bare: _Bare,
+        chosen: Sequence[Keyframe],
+        times_s: Sequence[float],
+        tracked: Callable[[int], None],
+        adjusting: Callable[[], None],
+    ) -> tuple[float, LoopReport]:
+        """Build a map of pairs that are measured once each; the 1-sigma of its focal length, and what its loops did."""
+        settings, reprojector = self._settings, self.reprojector
+        keyframes, graph, adjuster, masks = bare.keyframes, bare.graph, bare.adjuster, bare.masks
+        measured = MeasuredGraph(
+            keyframes,
+            graph,
+            self._priors.matcher,
+            self._priors.tracker if settings.terms.sparse_tracks else None,
+            self._priors.points,
+            reprojector,
+            dense_flow=settings.terms.dense_flow,
+            aligner=self._priors.aligner,
+        )
+        backend = Backend(measured, adjuster, reprojector, masks, settings, self._size.width)
+        tracker = Tracker(measured, adjuster, reprojector, masks, settings, settings.scaled_px(1.0, self._size.width))
+        with self._clock("track"):
+            first = min(len(chosen), settings.min_keyframes)
+            bootstrap = Bootstrap(measured, adjuster, reprojector, masks, settings.neighbours)
+            bootstrap.run(chosen[:first], times_s[:first])
+            for done in range(first, len(chosen) + 1):
+                if done > first:
+                    tracker.add(chosen[done - 1], times_s[done - 1])
+                if settings.backend_due(done) and done < len(chosen):
+                    backend.run()
+                tracked(chosen[done - 1].index + 1)
+        before = keyframes.snapshot()
+        with self._clock("backend"):
+            adjuster.alive = adjusting
+            adjusting()
+            backend.run()
+            adjuster.alive = _nothing
+            loops = examine_loops(reprojector, keyframes, graph, before, settings.neighbours)
+            backend.recentre()
+            backend.sharpen()
+        return backend.focal_sigma_ratio, loops
+
+    def _refined(
+        self,
+        bare: _Bare,
+        chosen: Sequence[Keyframe],
+        times_s: Sequence[float],
+        tracked: Callable[[int], None],
+        adjusting: Callable[[], None],
+    ) -> tuple[float, LoopReport]:
+        """Build a map whose measurements are refined in turns with it; like `_measured` otherwise.
+
+        Masks are not part of the refinement, whose weights know what moves; they are found from what it measured.
+        """
+        assert self._priors.refiner is not None
+        settings, reprojector, refiner = self._settings, self.reprojector, self._priors.refiner
+        keyframes, graph, adjuster = bare.keyframes, bare.graph, bare.adjuster
+        schedule, scale_px = settings.refinement, settings.scaled_px(1.0, self._size.width)
+        tracker = RefinedTracker(refiner, keyframes, adjuster, reprojector, schedule, scale_px)
+        backend = RefinedBackend(refiner, keyframes, graph, adjuster, reprojector, schedule, scale_px)
+        on_the_way, again, finally_ = schedule.global_updates
+        with self._clock("track"):
+            first = min(len(chosen), settings.min_keyframes)
+            tracker.start(chosen[:first], times_s[:first])
+            counted = first
+            for done in range(first, len(chosen) + 1):
+                if done > first:
+                    tracker.add(chosen[done - 1], times_s[done - 1])
+                # A redundant keyframe takes its number back: the same count must not run twice.
+                grown = done == first or len(keyframes) > counted
+                counted = max(counted, len(keyframes))
+                if grown and settings.backend_due(counted) and done < len(chosen):
+                    backend.run(on_the_way)
+                tracked(chosen[done - 1].index + 1)
+        with self._clock("backend"):
+            adjuster.alive = adjusting
+            adjusting()
+            backend.run(again)
+            before = keyframes.snapshot()
+            backend.run(finally_)
+            adjuster.alive = _nothing
+            loops = examine_loops(reprojector, keyframes, graph, before, schedule.neighbours)
+            bare.masks.update(range(len(keyframes)))
+        return backend.focal_sigma_ratio, loops
 
     def _rotation_only(
         self, fitter: RotationFitter, keyframes: KeyframeMap, graph: Graph, prior: FocalPrior, found: MapReport
@@ -194,3 +264,7 @@ class ShotMapper:
             keyframes.set_depth(k, np.ones(keyframes.grid.num_cells))
             keyframes.set_static(k, np.ones(keyframes.grid.num_cells, dtype=np.bool_))
         return math.hypot(inflation * fit.log_focal_sigma, self._settings.lens_sigma)
+
+
+def _nothing() -> None:
+    pass

@@ -52,10 +52,9 @@ def close_pairs(
         older = [target for target in candidates if target < source]
         if not older:
             continue
-        if len(older) > _EXAMINED:
-            older = _screened(reprojector, keyframes, source, older, max_motion_px, min_overlap)
-            if not older:
-                continue
+        older = screened(reprojector, keyframes, source, older, max_motion_px, min_overlap)
+        if not older:
+            continue
         there = reprojector.fan(keyframes, [source] * len(older), older, _SUBSAMPLE)
         back = reprojector.fan(keyframes, older, [source] * len(older), _SUBSAMPLE)
         overlap = np.minimum(there.overlap, back.overlap)
@@ -68,7 +67,7 @@ def close_pairs(
     return sorted(pairs, key=lambda pair: (pair.motion_px, pair.source, pair.target))
 
 
-def _screened(
+def screened(
     reprojector: Reprojector,
     keyframes: KeyframeMap,
     source: int,
@@ -76,7 +75,9 @@ def _screened(
     max_motion_px: float,
     min_overlap: float,
 ) -> list[int]:
-    """The `_EXAMINED` targets that look nearest from `source`, in their order: the work per keyframe stays bounded."""
+    """The targets, or the `_EXAMINED` of them that look nearest from `source`, in their order: work stays bounded."""
+    if len(targets) <= _EXAMINED:
+        return list(targets)
     subsample = max(1, min(reprojector.grid.height, reprojector.grid.width) // _COARSE_LINES)
     fan = reprojector.fan(keyframes, [source] * len(targets), targets, subsample)
     possible = (fan.motion_px <= _COARSE_SLACK * max_motion_px) & (fan.overlap >= min_overlap / _COARSE_SLACK)

@@ -8,6 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from vipe_core.errors import ConfigError
+from vipe_core.slam.recurrent.settings import RefinementSettings
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,6 +65,7 @@ class SlamSettings:
             focal length counts as not observed.
         infill_batch: Frames posed in one motion-only adjustment.
         terms: Which terms of the energy are there.
+        refinement: The schedule where measurements are refined in turns with the map.
     """
 
     working_area_px: int = 640 * 480
@@ -88,6 +90,7 @@ class SlamSettings:
     fov_doubt_ratio: float = 0.1
     infill_batch: int = 16
     terms: EnergyTerms = field(default_factory=EnergyTerms)
+    refinement: RefinementSettings = field(default_factory=RefinementSettings)
 
     def backend_due(self, num_keyframes: int) -> bool:
         """Whether a global adjustment runs at this many keyframes; their sizes sum to less than twice the last one."""

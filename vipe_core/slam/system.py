@@ -97,7 +97,10 @@ class Slam:
         """
         clock = StageClock()
         settings = self._settings
-        size = working_size(source.info.width, source.info.height, settings.working_area_px)
+        refiner = self._priors.refiner
+        offset_px = None if refiner is None else refiner.offset_px
+        info = source.info
+        size = working_size(info.width, info.height, settings.working_area_px, offset_px=offset_px)
         frames = EncodedFrames(source, size, self._priors.matcher, settings.frame_cache_bytes)
         with clock("scan"):
             selection = select_keyframes(frames, size, settings, report)
@@ -113,7 +116,15 @@ class Slam:
             tracks_only = None if settings.terms.dense_flow else self._priors.tracker
             aligner = self._priors.aligner if settings.terms.dense_flow else None
             trajectory = fill_in(
-                maps, frames, selection.placed, mapper.reprojector, settings.infill_batch, report, aligner, tracks_only
+                maps,
+                frames,
+                selection.placed,
+                mapper.reprojector,
+                settings.infill_batch,
+                report,
+                aligner,
+                tracks_only,
+                None if refiner is None else (refiner, settings.refinement),
             )
             frames.release()
         return SlamResult(

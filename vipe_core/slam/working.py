@@ -24,23 +24,29 @@ class WorkingSize:
 
     The two axes may scale slightly differently because both are rounded to whole cells; `Camera.resized` carries that
     into fx and fy exactly.
+
+    Attributes:
+        stride: Pixels on the sides of a cell.
+        offset_px: Where in a cell its sample point is; its centre if None.
     """
 
     width: int
     height: int
     stride: int = 8
+    offset_px: float | None = None
 
     @property
     def grid(self) -> Grid:
-        """Cells of the working image; each samples the centre of its block of `stride` x `stride` pixels."""
-        return Grid(self.height // self.stride, self.width // self.stride, float(self.stride), (self.stride - 1) / 2)
+        """Cells of the working image, blocks of `stride` x `stride` pixels."""
+        offset_px = (self.stride - 1) / 2 if self.offset_px is None else self.offset_px
+        return Grid(self.height // self.stride, self.width // self.stride, float(self.stride), offset_px)
 
     @property
     def size(self) -> tuple[int, int]:
         return self.width, self.height
 
 
-def working_size(width: int, height: int, area_px: int, stride: int = 8) -> WorkingSize:
+def working_size(width: int, height: int, area_px: int, stride: int = 8, offset_px: float | None = None) -> WorkingSize:
     """Working size of a video of `width` x `height` pixels: about `area_px`, whole cells, never enlarged.
 
     A video smaller than a few cells is enlarged to them, the least that a grid needs.
@@ -51,7 +57,7 @@ def working_size(width: int, height: int, area_px: int, stride: int = 8) -> Work
         cells = round(length * scale / stride)
         return stride * max(_MIN_CELLS, min(cells, length // stride))
 
-    return WorkingSize(whole_cells(width), whole_cells(height), stride)
+    return WorkingSize(whole_cells(width), whole_cells(height), stride, offset_px)
 
 
 def working_frame(frame: Frame) -> WorkingFrame:
