@@ -46,7 +46,7 @@ def test_a_principal_point_that_is_off_is_found() -> None:
 def test_a_right_principal_point_and_a_short_map_stay_as_they_are() -> None:
     for offset_px, count in ((0.0, COUNT), (3.0, 5)):
         keyframes, graph, adjuster = adjusted(offset_px, count)
-        poses, depths, intrinsics = keyframes.snapshot()
+        poses, depths, intrinsics, _ = keyframes.snapshot()
         assert not refine_principal_point(keyframes, graph, adjuster)
         np.testing.assert_array_equal(keyframes.poses(), poses)
         np.testing.assert_array_equal(keyframes.depths(), depths)

@@ -76,6 +76,25 @@ def analyse(num_nodes: int, cliques: Sequence[Sequence[int]], dense_last: bool) 
     return Structure(place, first, rows)
 
 
+def pattern(num_nodes: int, cliques: Sequence[Sequence[int]], dense_last: bool) -> Structure:
+    """The blocks of a matrix in the order of its nodes, without any fill: to add up, not to be factorised.
+
+    Args:
+        num_nodes, cliques, dense_last: As in `analyse`.
+    """
+    below: list[set[int]] = [{node} for node in range(num_nodes)]
+    for clique in cliques:
+        for node in clique:
+            below[node].update(other for other in clique if other > node)
+    rows = [sorted(column) for column in below]
+    if dense_last:
+        rows = [[*column, num_nodes] for column in rows]
+        rows.append([num_nodes])
+    first = np.zeros(len(rows) + 1, np.int64)
+    first[1:] = np.cumsum([len(column) for column in rows])
+    return Structure(np.arange(len(rows)), first, np.concatenate([np.array(column, np.int64) for column in rows]))
+
+
 def _eliminate(neighbours: list[set[int]]) -> tuple[list[int], list[list[int]]]:
     """Nodes in order of least degree (ties: lowest number), and the later nodes that each is coupled with by then."""
     order: list[int] = []

@@ -20,8 +20,9 @@ from torch import Tensor
 
 from vipe_core.ba import block_cholesky, kernels
 from vipe_core.ba.problem import Options, Problem, State
-from vipe_core.ba.reduced import add_twists, damp
-from vipe_core.ba.reprojection import min_depth_factor
+from vipe_core.ba.reduced import add_frames, add_twists, damp
+from vipe_core.ba.reprojection import cameras_of, min_depth_factor
+from vipe_core.ba.rigs import extrinsic_prior, moved_poses, turns_of, unknowns_of
 from vipe_core.ba.solver import ALPHA_RANGE, MAX_LOG_FOCAL_STEP, Cost, Step
 from vipe_core.cameras import projection
 from vipe_core.geometry import se3
@@ -68,6 +69,8 @@ class HostSolver:
         self._dtype = dtype
         edges, free = problem.edges, problem.free
         num_frames = len(free.poses)
+        cameras, camera_of = cameras_of(state.intrinsics, problem.rig, num_frames)
+        self._num_cameras = len(cameras)
         order = torch.argsort(edges.source * num_frames + edges.target, stable=True)
         self._source, self._target = edges.source[order], edges.target[order]
         degree = torch.bincount(edges.source, minlength=num_frames)
@@ -81,23 +84,30 @@ class HostSolver:
             target_px=_flat(edges.target_px, dtype),
             weight=_flat(edges.weight, dtype),
             depth_free=depth_free,
+            source_camera=camera_of.numpy(),
+            target_camera=camera_of[self._target].numpy(),
         )
         size = np.where(depth_free, 6 * degree.numpy() + kernels.TAIL, 0)
         self._offset = np.zeros(num_frames + 1, np.int64)
         np.cumsum(size * size, out=self._offset[1:])
         self._prior = self._depth_prior(dtype)
 
-        touched = torch.zeros(num_frames, dtype=torch.bool)
-        touched[edges.source] = True
-        touched[edges.target] = True
-        self._nodes = torch.nonzero(free.poses.cpu() & touched)[:, 0].numpy()
+        self._unknowns = unknowns = unknowns_of(problem)
+        # Of the rig poses, then of the extrinsics that move, their numbers among the unknowns; -1 for what is held.
+        number = np.cumsum(np.concatenate((unknowns.poses.numpy(), unknowns.views.numpy()))) - 1
+        number[~np.concatenate((unknowns.poses.numpy(), unknowns.views.numpy()))] = -1
+        self._num_unknown = int(unknowns.poses.sum() + unknowns.views.sum())
+        self._pose_of = number[unknowns.pose_of_frame.numpy()]
+        self._number_of_view = number[len(unknowns.poses) :]
         self.intrinsics_free = (free.focal, free.distortion and problem.camera_model == "mei")
         self._free = np.array(self.intrinsics_free)
-        self.anything_free = bool(len(self._nodes) or self._free.any() or depth_free.any())
+        self.anything_free = bool(self._num_unknown or self._free.any() or depth_free.any())
         self._structure = self._analyse()
-        self._place = np.full(num_frames, -1, np.int64)
-        self._place[self._nodes] = self._structure.place[: len(self._nodes)]
-        self._shared = len(self._nodes) if self._free.any() else -1
+        # Columns of each frame's pose and of each view's extrinsics; -1 where held.
+        place = np.append(self._structure.place[: self._num_unknown], -1)
+        self._pose_place, self._view_place = place[self._pose_of], place[self._number_of_view]
+        self._shared = self._num_unknown if self._free.any() else -1
+        self._per_frame = None if problem.rig is None else self._structure_of_frames()
 
         self._kernel = kernels.ROBUST_CODE[options.robust]
         self._sample_px = problem.grid.sample_px()
@@ -118,20 +128,42 @@ class HostSolver:
             priors.inverse_depth_weight.to(dtype).contiguous().numpy(),
         )
 
-    def _analyse(self) -> block_cholesky.Structure:
-        """A frame with free depths couples all poses that see it; an edge with fixed ones couples two."""
-        number = np.full(len(self._depth_free), -1, np.int64)
-        number[self._nodes] = np.arange(len(self._nodes))
-        source, target = number[self._source.numpy()], number[self._target.numpy()]
+    def _cliques(self, of_frame: Callable[[int], list[int]]) -> list[list[int]]:
+        """Sets of unknowns that are coupled: a frame with free depths couples all that see it, an edge with fixed ones
+        what is at its ends.
+
+        Args:
+            of_frame: The unknowns behind a frame's twist.
+        """
+        behind = [of_frame(frame) for frame in range(len(self._depth_free))]
+        target = self._target.tolist()
         cliques: list[list[int]] = []
         first = self._graph.first
         for frame, free in enumerate(self._depth_free):
             begin, end = first[frame], first[frame + 1]
             if free:
-                cliques.append([node for node in (number[frame], *target[begin:end]) if node >= 0])
-            elif number[frame] >= 0:
-                cliques += [[i, j] for i, j in zip(source[begin:end], target[begin:end], strict=True) if j >= 0]
-        return block_cholesky.analyse(len(self._nodes), cliques, dense_last=bool(self._free.any()))
+                cliques.append([node for k in (frame, *target[begin:end]) for node in behind[k]])
+            elif behind[frame]:
+                cliques += [[*behind[frame], *behind[j]] for j in target[begin:end] if behind[j]]
+        return cliques
+
+    def _analyse(self) -> block_cholesky.Structure:
+        view_of = self._number_of_view[self._unknowns.view_of_frame.numpy()].tolist()
+        pose_of = self._pose_of.tolist()
+
+        def unknown(frame: int) -> list[int]:
+            return [node for node in (pose_of[frame], view_of[frame]) if node >= 0]
+
+        return block_cholesky.analyse(self._num_unknown, self._cliques(unknown), dense_last=bool(self._free.any()))
+
+    def _structure_of_frames(self) -> block_cholesky.Structure:
+        """Blocks of the system in the twists of frames, before it is taken to those of a rig: nothing is eliminated."""
+        moving = self._unknowns.frames.tolist()
+
+        def alone(frame: int) -> list[int]:
+            return [frame] if moving[frame] else []
+
+        return block_cholesky.pattern(len(moving), self._cliques(alone), dense_last=bool(self._free.any()))
 
     # -- state -----------------------------------------------------------------------------------------------------
 
@@ -145,18 +177,21 @@ class HostSolver:
         return self._seen[1:]
 
     def _see(self, state: State) -> tuple[kernels.Pose, Tensor]:
-        model, intrinsics = self.problem.camera_model, state.intrinsics
+        model, intrinsics = self.problem.camera_model, state.intrinsics.reshape(self._num_cameras, -1)
         transform = se3.relative(state.cam_from_world[self._target], state.cam_from_world[self._source])
         if self._rays is None or not torch.equal(self._rays[0], intrinsics):
-            rays = projection.unproject(model, intrinsics, self._sample_px)
-            by_intrinsics = projection.unproject_jacobian(model, intrinsics, self._sample_px)
-            least = min_depth_factor(model, intrinsics, self._sample_px, rays, self.options.min_depth_ratio)
-            both = torch.zeros(2, 3, len(rays), dtype=self._dtype)
-            both[: by_intrinsics.shape[2]] = by_intrinsics.permute(2, 1, 0)
-            planar = rays.T.to(self._dtype).contiguous()
-            self._rays = (intrinsics.clone(), planar.numpy(), both.numpy(), least.to(self._dtype).numpy())
-        camera = torch.zeros(5, dtype=self._dtype)
-        camera[: len(intrinsics)] = intrinsics
+            tables = torch.empty(self._num_cameras, 3, len(self._sample_px), dtype=self._dtype)
+            slopes = torch.zeros(self._num_cameras, 2, 3, len(self._sample_px), dtype=self._dtype)
+            floors = torch.empty(self._num_cameras, len(self._sample_px), dtype=self._dtype)
+            for number, camera in enumerate(intrinsics):
+                rays = projection.unproject(model, camera, self._sample_px)
+                by_intrinsics = projection.unproject_jacobian(model, camera, self._sample_px)
+                tables[number] = rays.T
+                slopes[number, : by_intrinsics.shape[2]] = by_intrinsics.permute(2, 1, 0)
+                floors[number] = min_depth_factor(model, camera, self._sample_px, rays, self.options.min_depth_ratio)
+            self._rays = (intrinsics.clone(), tables.numpy(), slopes.numpy(), floors.numpy())
+        cameras = torch.zeros(self._num_cameras, 5, dtype=self._dtype)
+        cameras[:, : intrinsics.shape[1]] = intrinsics
         return (
             kernels.Pose(
                 transform=transform[:, :3].flatten(1).to(self._dtype).contiguous().numpy(),
@@ -164,7 +199,7 @@ class HostSolver:
                 rays_by_intrinsics=self._rays[2],
                 min_s=self._rays[3],
                 inverse_depth=state.inverse_depth.contiguous().numpy(),
-                camera=camera.numpy(),
+                camera=cameras.numpy(),
             ),
             transform,
         )
@@ -190,7 +225,12 @@ class HostSolver:
         priors = self.problem.priors
         if priors.log_focal is not None and self.intrinsics_free[0]:
             prior += ((np.log(float(state.intrinsics[0])) - priors.log_focal) / priors.log_focal_sigma) ** 2
+        if (extrinsic := self._extrinsic_prior(state)) is not None:
+            prior += float(extrinsic[0].square().sum())
         return Cost(*torch.tensor([measurements, weight, everything - weight, prior], dtype=torch.float64))
+
+    def _extrinsic_prior(self, state: State) -> tuple[Tensor, Tensor, Tensor] | None:
+        return extrinsic_prior(self.problem.priors, state) if self.problem.free.extrinsics else None
 
     # -- the solver's interface ------------------------------------------------------------------------------------
 
@@ -227,30 +267,58 @@ class HostSolver:
             )
         )
         adjoint = se3.adjoint(transform).contiguous().numpy()
-        direct = np.zeros((structure.num_blocks, 6, 6))
-        direct_gradient = np.zeros((structure.num_nodes, 6))
-        eliminated, eliminated_gradient = np.zeros_like(direct), np.zeros_like(direct_gradient)
-        place = self._place
+        turn = None if self._per_frame is None else np.asarray(turns_of(self.problem, state))
+        assembled = self._per_frame or structure
+        # The blocks of a frame: those of its pose, or of its own twist where these are still to be taken to a rig.
+        place = self._pose_place
+        if self._per_frame is not None:
+            place = np.where(self._unknowns.frames.numpy(), np.arange(len(place)), -1)
         source, target = place[self._source.numpy()], place[self._target.numpy()]
+        shared = -1 if self._shared < 0 else assembled.num_nodes - 1
 
-        def add(group: Array, offset: Array, matrices: Array, blocks: Array, gradient: Array) -> None:
+        def add(group: Array, offset: Array, matrices: Array) -> tuple[Array, Array]:
+            blocks, gradient = np.zeros((assembled.num_blocks, 6, 6)), np.zeros((assembled.num_nodes, 6))
             add_twists(
-                structure.first,
-                structure.rows,
+                assembled.first,
+                assembled.rows,
                 group,
                 source,
                 target,
-                self._shared,
+                shared,
                 adjoint,
                 offset,
                 matrices,
                 blocks,
                 gradient,
             )
+            if turn is None:
+                return blocks, gradient
+            into, into_gradient = np.zeros((structure.num_blocks, 6, 6)), np.zeros((structure.num_nodes, 6))
+            last = -1 if shared < 0 else structure.num_nodes - 1
+            add_frames(
+                assembled.first,
+                assembled.rows,
+                blocks,
+                gradient,
+                turn,
+                np.append(self._pose_place, -1),
+                np.append(self._view_place[self._unknowns.view_of_frame.numpy()], last),
+                structure.first,
+                structure.rows,
+                into,
+                into_gradient,
+            )
+            return into, into_gradient
 
         singly = np.arange(len(source) + 1)
-        add(singly, kernels.ROWS**2 * singly, per_edge, direct, direct_gradient)
-        add(graph.first, self._offset, per_frame, eliminated, eliminated_gradient)
+        direct, direct_gradient = add(singly, kernels.ROWS**2 * singly, per_edge)
+        eliminated, eliminated_gradient = add(graph.first, self._offset, per_frame)
+        if (extrinsic := self._extrinsic_prior(state)) is not None:
+            _, hessian, pull = extrinsic
+            for view in np.flatnonzero(self._view_place >= 0):
+                node = self._view_place[view]
+                direct[structure.first[node]] += hessian[view].numpy()
+                direct_gradient[node] += pull[view].numpy()
         priors = self.problem.priors
         if priors.log_focal is not None and self.intrinsics_free[0]:
             information = 1 / priors.log_focal_sigma**2
@@ -294,15 +362,22 @@ class HostSolver:
             current = float(state.intrinsics[4])
             alpha = float(np.clip(current + solution[-1, 1], *ALPHA_RANGE)) - current
             solution[-1, 1] = alpha
-        pose = np.zeros((len(self._place), 6))
-        pose[self._nodes] = solution[self._place[self._nodes]]
+        padded = np.concatenate((solution, np.zeros((1, 6))))
+        pose = padded[self._pose_place]
+        total, extrinsic = pose, None
+        if self.problem.rig is not None:
+            turn = np.asarray(turns_of(self.problem, state))
+            pose = (turn @ pose[:, :, None])[:, :, 0]
+            by_view = padded[self._view_place]
+            total = pose + by_view[self._unknowns.view_of_frame.numpy()]
+            extrinsic = torch.from_numpy(by_view)
         predicted_drop = float((system.direct_gradient * solution).sum())
 
         depth = torch.zeros_like(state.inverse_depth)
         if factorised and self._depth_free.any():
             twist = np.empty((len(self._source), 8), self._graph.weight.dtype)
-            moved = (system.adjoint @ pose[self._source.numpy()][:, :, None])[:, :, 0]
-            twist[:, :6] = pose[self._target.numpy()] - moved
+            moved = (system.adjoint @ total[self._source.numpy()][:, :, None])[:, :, 0]
+            twist[:, :6] = total[self._target.numpy()] - moved
             twist[:, 6], twist[:, 7] = log_focal, alpha
             gain = np.empty(len(self._depth_free))
             damping_of, out = self._number(damping), depth.numpy()
@@ -324,23 +399,25 @@ class HostSolver:
             predicted_drop += float(gain.sum())
         return Step(
             pose=torch.from_numpy(pose),
-            log_focal=torch.tensor(log_focal, dtype=torch.float64),
-            alpha=torch.tensor(alpha, dtype=torch.float64),
+            log_focal=torch.full(state.intrinsics.shape[:-1], log_focal, dtype=torch.float64),
+            alpha=torch.full(state.intrinsics.shape[:-1], alpha, dtype=torch.float64),
             inverse_depth=depth,
             predicted_drop=torch.tensor(predicted_drop, dtype=torch.float64),
             factorised=torch.tensor(factorised),
+            extrinsic=extrinsic,
         )
 
     def retract(self, state: State, step: Step) -> State:
         """The state after a step. Whatever the step does not touch keeps its bits."""
         intrinsics = state.intrinsics.clone()
-        intrinsics[:2] *= step.log_focal.exp()
+        intrinsics[..., :2] *= step.log_focal.exp()[..., None]
         if self._free[1]:
-            intrinsics[4] += step.alpha
+            intrinsics[..., 4] += step.alpha
         inverse_depth = (state.inverse_depth + step.inverse_depth).clamp_(*self._depth_range)
         held = torch.from_numpy(~self._depth_free)
         inverse_depth[held] = state.inverse_depth[held]
-        return State(se3.exp(step.pose) @ state.cam_from_world, inverse_depth, intrinsics)
+        cam_from_world, cam_from_rig = moved_poses(self.problem, state, step)
+        return State(cam_from_world, inverse_depth, intrinsics, cam_from_rig)
 
     def intrinsics_covariance(self, system: HostSystem, damping: float) -> Tensor:
         """See `Solver.intrinsics_covariance`."""
@@ -349,13 +426,13 @@ class HostSolver:
         covariance = np.zeros((2, 2))
         if not factorised or not (scale[-1, free] > 0).all():
             covariance[np.ix_(free, free)] = np.nan
-            return torch.from_numpy(covariance)
+            return torch.from_numpy(covariance)[None]
         for column in free:
             unit = np.zeros_like(scale)
             unit[-1, column] = scale[-1, column]
             block_cholesky.substitute(self._structure.first, self._structure.rows, factor, unit)
             covariance[free, column] = (scale[-1] * unit[-1])[free]
-        return torch.from_numpy(covariance)
+        return torch.from_numpy(covariance)[None]
 
 
 def _flat(measurements: Tensor, dtype: torch.dtype) -> Array:

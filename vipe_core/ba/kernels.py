@@ -43,7 +43,8 @@ _JACOBIAN_SIZE = 26 * TILE
 class Graph(NamedTuple):
     """Edges in order of (source, target): `edge` (E,) numbers the problem's, those of frame i are first[i]:first[i+1].
 
-    target_px and weight are (E, 2 P) in the problem's order, (u, v) alternating; depth_free (N,) bool.
+    target_px and weight are (E, 2 P) in the problem's order, (u, v) alternating; depth_free (N,) bool. Which intrinsics
+    are meant say source_camera (N,) and, in order, target_camera (E,).
     """
 
     first: Array
@@ -51,12 +52,14 @@ class Graph(NamedTuple):
     target_px: Array
     weight: Array
     depth_free: Array
+    source_camera: Array
+    target_camera: Array
 
 
 class Pose(NamedTuple):
-    """A state: transform (E, 12) rows of [R | t] in order, rays (3, P), their derivatives (2, 3, P), min_s (P,).
+    """A state: transform (E, 12) rows of [R | t] in order, rays (C, 3, P), their derivatives (C, 2, 3, P).
 
-    inverse_depth (N, P), camera (fx, fy, cx, cy, alpha), all of one dtype.
+    min_s (C, P), inverse_depth (N, P), camera (C, 5) with (fx, fy, cx, cy, alpha), all of one dtype.
     """
 
     transform: Array
@@ -79,9 +82,10 @@ def _see(graph: Graph, pose: Pose, frame: int, order: int, start: int, n: int, v
     """Fill the view of an edge's tile; returns the sum of the larger weights, imaged or not."""
     row, edge = pose.transform[order], graph.edge[order]
     target, weight = graph.target_px[edge][2 * start : 2 * (start + n)], graph.weight[edge][2 * start : 2 * (start + n)]
-    rx, ry, rz = pose.rays[0][start:], pose.rays[1][start:], pose.rays[2][start:]
-    depth, least = pose.inverse_depth[frame][start:], pose.min_s[start:]
-    fx, fy, cx, cy, alpha = pose.camera[0], pose.camera[1], pose.camera[2], pose.camera[3], pose.camera[4]
+    rays, camera = pose.rays[graph.source_camera[frame]], pose.camera[graph.target_camera[order]]
+    rx, ry, rz = rays[0][start:], rays[1][start:], rays[2][start:]
+    depth, least = pose.inverse_depth[frame][start:], pose.min_s[graph.source_camera[frame]][start:]
+    fx, fy, cx, cy, alpha = camera[0], camera[1], camera[2], camera[3], camera[4]
     r00, r01, r02, t0 = row[0], row[1], row[2], row[3]
     r10, r11, r12, t1 = row[4], row[5], row[6], row[7]
     r20, r21, r22, t2 = row[8], row[9], row[10], row[11]
@@ -182,12 +186,12 @@ def _reweigh(kernel: int, c2: float, view: Array, n: int) -> None:
 
 @vectorised
 def _differentiate(
-    pose: Pose, frame: int, order: int, start: int, n: int, free: Array, view: Array, jacobian: Array
+    graph: Graph, pose: Pose, frame: int, order: int, start: int, n: int, free: Array, view: Array, jacobian: Array
 ) -> None:
     """Scaled rows of a reweighed tile, with zeros after its last cell."""
-    row = pose.transform[order]
+    row, camera = pose.transform[order], pose.camera[graph.target_camera[order]]
     depth = pose.inverse_depth[frame][start:]
-    fx, fy, alpha = pose.camera[0], pose.camera[1], pose.camera[4]
+    fx, fy, alpha = camera[0], camera[1], camera[4]
     t0, t1, t2 = row[3], row[7], row[11]
     one = view.dtype.type(1)
     for p in range(n):
@@ -212,7 +216,8 @@ def _differentiate(
         jacobian[_BY_POINT + 4 * TILE + p], jacobian[_BY_POINT + 5 * TILE + p] = u2, v2
     for k in range(2):
         if free[k]:
-            _intrinsic_row(pose, row, k, start, n, view, jacobian)
+            rays = pose.rays_by_intrinsics[graph.source_camera[frame], k]
+            _intrinsic_row(rays, camera, row, k, start, n, view, jacobian)
     if n < TILE:
         for r in range(20):
             for p in range(n, TILE):
@@ -220,11 +225,12 @@ def _differentiate(
 
 
 @vectorised
-def _intrinsic_row(pose: Pose, row: Array, k: int, start: int, n: int, view: Array, jacobian: Array) -> None:
-    """The row of log f (k = 0) or alpha (k = 1): J_X R d ray / dk + d project / dk."""
-    rays = pose.rays_by_intrinsics[k]
+def _intrinsic_row(
+    rays: Array, camera: Array, row: Array, k: int, start: int, n: int, view: Array, jacobian: Array
+) -> None:
+    """The row of log f (k = 0) or alpha (k = 1): J_X R d ray / dk + d project / dk, with `rays` (3, P) d ray / dk."""
     rx, ry, rz = rays[0][start:], rays[1][start:], rays[2][start:]
-    fx, fy = pose.camera[0], pose.camera[1]
+    fx, fy = camera[0], camera[1]
     r00, r01, r02, r10, r11, r12 = row[0], row[1], row[2], row[4], row[5], row[6]
     r20, r21, r22 = row[8], row[9], row[10]
     by_point = jacobian[_BY_POINT : _BY_POINT + 6 * TILE]
@@ -329,7 +335,7 @@ def evaluate(
         scale: (1,) squared scale of the kernel, px^2.
         sums: (N, 4) float64 zeros, filled with wmax rho(s), wmax of what is imaged, all wmax, and the prior's cost.
     """
-    cells = pose.rays.shape[1]
+    cells = pose.rays.shape[2]
     view, pull, weight = (
         np.empty(_VIEW_SIZE, pose.rays.dtype),
         np.empty(TILE, pose.rays.dtype),
@@ -372,7 +378,7 @@ def linearise(
         eliminated: Flat float64 zeros: per frame with D edges and free depths, (6 D + 3)^2 numbers that eliminating
             the undamped depths subtracts; rows are the twists of the edges, log f, alpha, right-hand side.
     """
-    cells, dtype = pose.rays.shape[1], pose.rays.dtype
+    cells, dtype = pose.rays.shape[2], pose.rays.dtype
     most = 0
     for frame in range(begin, end):
         most = max(most, graph.first[frame + 1] - graph.first[frame])
@@ -399,7 +405,7 @@ def linearise(
                 sums[frame, 0] += cost
                 sums[frame, 1] += kept
                 _reweigh(kernel, scale[0], view, n)
-                _differentiate(pose, frame, order, start, n, free, view, jacobian)
+                _differentiate(graph, pose, frame, order, start, n, free, view, jacobian)
                 _gram(jacobian, 3, 2 * TILE, direct, ROWS * ROWS * order)
                 if depth_free:
                     _couple(jacobian, free, degree, order - first, coupling, curvature)
@@ -416,7 +422,16 @@ def linearise(
 
 @vectorised
 def _follow(
-    pose: Pose, twist: Array, order: int, frame: int, start: int, n: int, view: Array, change: Array, sums: Array
+    graph: Graph,
+    pose: Pose,
+    twist: Array,
+    order: int,
+    frame: int,
+    start: int,
+    n: int,
+    view: Array,
+    change: Array,
+    sums: Array,
 ) -> None:
     """Add an edge's part in the step of the depths: sums rows are curvature, right-hand side, and what is left of it.
 
@@ -424,9 +439,9 @@ def _follow(
         twist: (8,) step of the edge's twist, log f and alpha.
         change: Scratch for three rows.
     """
-    row = pose.transform[order]
+    row, camera = pose.transform[order], pose.camera[graph.target_camera[order]]
     depth = pose.inverse_depth[frame][start:]
-    fx, fy, alpha = pose.camera[0], pose.camera[1], pose.camera[4]
+    fx, fy, alpha = camera[0], camera[1], camera[4]
     t0, t1, t2 = row[3], row[7], row[11]
     a0, a1, a2, b0, b1, b2, df, da = twist[0], twist[1], twist[2], twist[3], twist[4], twist[5], twist[6], twist[7]
     zero, one = view.dtype.type(0), view.dtype.type(1)
@@ -434,7 +449,7 @@ def _follow(
         change[p] = zero
     for k in range(2):
         if twist[6 + k] != 0:
-            rays = pose.rays_by_intrinsics[k]
+            rays = pose.rays_by_intrinsics[graph.source_camera[frame], k]
             rx, ry, rz = rays[0][start:], rays[1][start:], rays[2][start:]
             step = twist[6 + k]
             for p in range(n):
@@ -486,7 +501,7 @@ def back_substitute(
         step: (N, P) filled where depths are free.
         gain: (N,) float64, filled with gradient times step.
     """
-    cells, dtype = pose.rays.shape[1], pose.rays.dtype
+    cells, dtype = pose.rays.shape[2], pose.rays.dtype
     view, change, sums = np.zeros(_VIEW_SIZE, dtype), np.zeros(3 * TILE, dtype), np.zeros(3 * TILE, dtype)
     zero, one, tiny = dtype.type(0), dtype.type(1), dtype.type(1.2e-38)
     for frame in range(begin, end):
@@ -502,7 +517,7 @@ def back_substitute(
             for order in range(first, last):
                 _see(graph, pose, frame, order, start, n, view)
                 _reweigh(kernel, scale[0], view, n)
-                _follow(pose, twist[order], order, frame, start, n, view, change, sums)
+                _follow(graph, pose, twist[order], order, frame, start, n, view, change, sums)
             out = step[frame][start : start + n]
             total = zero
             for p in range(n):

@@ -11,12 +11,13 @@ import math
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from vipe_core.ba import robust
 from vipe_core.ba.host_solver import HostSolver
-from vipe_core.ba.problem import Covariance, Edges, Options, Problem, Result, State, Status
+from vipe_core.ba.problem import NO_COVARIANCE, Covariance, Edges, Options, Problem, Result, Rig, State, Status
 from vipe_core.ba.reprojection import require_supported
 from vipe_core.ba.scale import largest_residual_px
 from vipe_core.ba.solver import Cost, Solver, Step
@@ -56,7 +57,8 @@ def solve(problem: Problem, state: State, options: Options | None = None) -> Res
 
     Raises:
         ConfigError: A camera model without derivatives here.
-        ValueError: Inverse depths that are neither float32 nor float64.
+        ValueError: Inverse depths that are neither float32 nor float64; a rig without its extrinsics, or with a pose
+            that is free in some frames only.
     """
     options = options or Options()
     problem, state = _on_device(problem, state)
@@ -77,21 +79,25 @@ def solve(problem: Problem, state: State, options: Options | None = None) -> Res
     descent.judge_at(options.robust_scale_px)
     status = descent.run()
 
-    covariance = _intrinsics_covariance(solver, descent) if any(solver.intrinsics_free) else ((0.0, 0.0), (0.0, 0.0))
+    covariances = _intrinsics_covariances(solver, descent) if any(solver.intrinsics_free) else (NO_COVARIANCE,)
     measured, weight = _read(descent.cost.measurements, descent.cost.weight)
-    return Result(descent.state, status, descent.iterations, initial_cost, measured, weight, covariance)
+    return Result(descent.state, status, descent.iterations, initial_cost, measured, weight, covariances)
 
 
-def _intrinsics_covariance(solver: Solver[Any], descent: _Descent) -> Covariance:
-    """By the least damping at which the system can be solved."""
-    found = [solver.intrinsics_covariance(descent.system(), damping) for damping in _SIGMA_DAMPINGS]
-    values = _read(*torch.stack(found).flatten())
-    for start in range(0, len(values), 4):
-        a, b, c, d = values[start : start + 4]
-        if all(value > 0 for value, free in zip((a, d), solver.intrinsics_free, strict=True) if free):
-            return (a, b), (c, d)
-    nan = math.nan
-    return (nan, nan), (nan, nan)
+def _intrinsics_covariances(solver: Solver[Any], descent: _Descent) -> tuple[Covariance, ...]:
+    """Of each camera, by the least damping at which the system can be solved."""
+    found = torch.stack([solver.intrinsics_covariance(descent.system(), damping) for damping in _SIGMA_DAMPINGS])
+    values = np.array(_read(*found.flatten())).reshape(len(_SIGMA_DAMPINGS), -1, 4)
+    chosen: list[Covariance] = []
+    for camera in range(values.shape[1]):
+        nan = math.nan
+        best: Covariance = ((nan, nan), (nan, nan))
+        for a, b, c, d in values[:, camera].tolist():
+            if all(value > 0 for value, free in zip((a, d), solver.intrinsics_free, strict=True) if free):
+                best = (a, b), (c, d)
+                break
+        chosen.append(best)
+    return tuple(chosen)
 
 
 class _Descent:
@@ -198,6 +204,9 @@ def _wider_scales(problem: Problem, state: State, options: Options) -> list[floa
 
 def _solver(problem: Problem, options: Options, state: State) -> Solver[Any]:
     on_host = state.inverse_depth.device.type == "cpu"
+    if state.intrinsics.ndim > 1 and (problem.free.focal or problem.free.distortion):
+        # An edge between two cameras that both move has more unknowns of its own than the compiled loops carry.
+        on_host = False
     return HostSolver(problem, options, state) if on_host else TorchSolver(problem, options, state)
 
 
@@ -208,7 +217,13 @@ def _on_device(problem: Problem, state: State) -> tuple[Problem, State]:
         raise ValueError(f"inverse depths must be float32 or float64, got {state.inverse_depth.dtype}")
     device = state.inverse_depth.device
     if state.cam_from_world.device != device or state.intrinsics.device != device:
-        state = State(state.cam_from_world.to(device), state.inverse_depth, state.intrinsics.to(device))
+        state = replace(state, cam_from_world=state.cam_from_world.to(device), intrinsics=state.intrinsics.to(device))
+    rig = problem.rig
+    if rig is not None:
+        if state.cam_from_rig is None:
+            raise ValueError("the state of a rig needs cam_from_rig")
+        state = replace(state, cam_from_rig=state.cam_from_rig.to(device))
+        rig = Rig(rig.pose_of_frame.to(device), rig.view_of_frame.to(device))
     edges, priors = problem.edges, problem.priors
     if priors.inverse_depth is not None and priors.inverse_depth_weight is not None:
         priors = replace(
@@ -217,7 +232,7 @@ def _on_device(problem: Problem, state: State) -> tuple[Problem, State]:
             inverse_depth_weight=priors.inverse_depth_weight.to(device),
         )
     edges = Edges(edges.source.to(device), edges.target.to(device), edges.target_px.to(device), edges.weight.to(device))
-    return replace(problem, edges=edges, priors=priors), state
+    return replace(problem, edges=edges, priors=priors, rig=rig), state
 
 
 def _finite(problem: Problem, state: State) -> bool:

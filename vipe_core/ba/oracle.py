@@ -1,7 +1,7 @@
 """One Gauss-Newton step of a small problem by brute force: the truth that the solvers are tested against.
 
 Float64, every Jacobian by automatic differentiation of the public camera and SE3 functions, the whole matrix over
-poses, intrinsics and inverse depths dense. Shares no linearisation, elimination or layout with the solvers.
+poses, extrinsics, intrinsics and inverse depths dense. Shares no linearisation, elimination or layout with the solvers.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ from torch import Tensor
 
 from vipe_core.ba import robust
 from vipe_core.ba.problem import Options, Problem, State
+from vipe_core.ba.rigs import extrinsic_residual
 from vipe_core.ba.solver import Step
 from vipe_core.cameras import projection
 from vipe_core.geometry import se3
@@ -22,42 +23,69 @@ def newton_step(problem: Problem, state: State, options: Options, damping: float
     Damping is the solver's: lambda times the curvature of each inverse depth, and lambda times the diagonal of the
     reduced system (the Schur complement of the damped depths). Steps of log f and alpha are not clamped here.
     """
-    edges, free = problem.edges, problem.free
+    edges, free, rig = problem.edges, problem.free, problem.rig
     num_frames, num_cells = state.inverse_depth.shape
-    touched = torch.zeros(num_frames, dtype=torch.bool)
-    touched[edges.source] = True
-    touched[edges.target] = True
+    pose_of = torch.arange(num_frames) if rig is None else rig.pose_of_frame
+    view_of = torch.zeros(num_frames, dtype=torch.int64) if rig is None else rig.view_of_frame
+    num_poses, num_views = int(pose_of.max()) + 1, int(view_of.max()) + 1
+    cam_from_rig = torch.eye(4, dtype=torch.float64).expand(num_views, 4, 4)
+    if state.cam_from_rig is not None:
+        cam_from_rig = state.cam_from_rig
+    cameras = state.intrinsics.reshape(-1, state.intrinsics.shape[-1])
+    num_cameras = len(cameras)
+    camera_of = view_of if num_cameras > 1 else torch.zeros_like(view_of)
+
+    apart = pose_of[edges.source] != pose_of[edges.target]
+    touched = torch.zeros(num_poses, dtype=torch.bool)
+    touched[pose_of[edges.source[apart]]] = True
+    touched[pose_of[edges.target[apart]]] = True
+    free_poses = torch.zeros(num_poses, dtype=torch.bool)
+    free_poses[pose_of[free.poses]] = True
+    seen_views = torch.zeros(num_views, dtype=torch.bool)
+    seen_views[view_of[edges.source]] = True
+    seen_views[view_of[edges.target]] = True
+    seen_views[0] = False
     sources = torch.zeros(num_frames, dtype=torch.bool)
     sources[edges.source] = True
+    bends = free.distortion and problem.camera_model == "mei"
     moving = torch.cat(
         (
-            (free.poses & touched).repeat_interleave(6),
-            torch.tensor([free.focal, free.distortion and problem.camera_model == "mei"]),
+            (free_poses & touched).repeat_interleave(6),
+            (seen_views & free.extrinsics).repeat_interleave(6),
+            torch.tensor([free.focal] * num_cameras + [bends] * num_cameras),
             (free.inverse_depth & sources).repeat_interleave(num_cells),
         )
     )
-    sizes = [6 * num_frames, 2, num_frames * num_cells]
+    sizes = [6 * num_poses, 6 * num_views, num_cameras, num_cameras, num_frames * num_cells]
+    num_shared = sum(sizes[:-1])
     sample_px = problem.grid.sample_px()
     sqrt_weight = edges.weight.double().sqrt()
     start = torch.zeros(len(moving), dtype=torch.float64)
 
-    def unpack(update: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        twists, intrinsics, depth = torch.split(update, sizes)
-        poses = se3.exp(twists.reshape(num_frames, 6)) @ state.cam_from_world
-        params = torch.cat((state.intrinsics[:2] * intrinsics[0].exp(), state.intrinsics[2:]))
+    def unpack(update: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        twists, extrinsics, log_focal, alpha, depth = torch.split(update, sizes)
+        views = se3.exp(extrinsics.reshape(num_views, 6)) @ cam_from_rig
+        if rig is None:
+            poses = se3.exp(twists.reshape(num_frames, 6)) @ state.cam_from_world
+        else:
+            rig_from_world = se3.inverse(cam_from_rig[view_of]) @ state.cam_from_world
+            poses = views[view_of] @ se3.exp(twists.reshape(num_poses, 6))[pose_of] @ rig_from_world
+        params = torch.cat((cameras[:, :2] * log_focal.exp()[:, None], cameras[:, 2:]), dim=1)
         if problem.camera_model == "mei":
-            params = torch.cat((params[:4], params[4:] + intrinsics[1]))
-        return poses, params, state.inverse_depth.double() + depth.reshape(num_frames, num_cells)
+            params = torch.cat((params[:, :4], params[:, 4:] + alpha[:, None]), dim=1)
+        return poses, views, params, state.inverse_depth.double() + depth.reshape(num_frames, num_cells)
 
     def measure(update: Tensor) -> tuple[Tensor, Tensor]:
-        poses, params, depth = unpack(update)
-        rays = projection.unproject(problem.camera_model, params, sample_px)
+        poses, _, params, depth = unpack(update)
+        # (K, E, 1): a number per edge.
+        from_camera, in_camera = (params[camera_of[ends]].T[..., None] for ends in (edges.source, edges.target))
+        rays = projection.unproject(problem.camera_model, from_camera, sample_px)
         transform = se3.relative(poses[edges.target], poses[edges.source])
-        points = torch.einsum("eij,pj->epi", transform[:, :3, :3], rays)
+        points = torch.einsum("eij,epj->epi", transform[:, :3, :3], rays)
         points = points + depth[edges.source][..., None] * transform[:, None, :3, 3]
-        px, valid = projection.project(problem.camera_model, params, points)
-        factor, _ = projection.depth_factor(problem.camera_model, params, points)
-        first, _ = projection.depth_factor(problem.camera_model, params, rays)
+        px, valid = projection.project(problem.camera_model, in_camera, points)
+        factor, _ = projection.depth_factor(problem.camera_model, in_camera, points)
+        first, _ = projection.depth_factor(problem.camera_model, from_camera, rays)
         return px - edges.target_px, valid & (factor > options.min_depth_ratio * first)
 
     residual, valid = measure(start)
@@ -67,12 +95,14 @@ def newton_step(problem: Problem, state: State, options: Options, damping: float
 
     def weighted(update: Tensor) -> Tensor:
         rows = [(scale * measure(update)[0]).flatten()]
-        _, params, depth = unpack(update)
+        _, views, params, depth = unpack(update)
         priors = problem.priors
         if priors.inverse_depth is not None and priors.inverse_depth_weight is not None:
             rows.append((priors.inverse_depth_weight.double().sqrt() * (depth - priors.inverse_depth)).flatten())
         if priors.log_focal is not None:
-            rows.append(((params[0].log() - priors.log_focal) / priors.log_focal_sigma)[None])
+            rows.append((params[:, 0].log() - torch.tensor(priors.log_focal)) / priors.log_focal_sigma)
+        if priors.cam_from_rig is not None:
+            rows.append(extrinsic_residual(views, priors).flatten())
         return torch.cat(rows)
 
     jacobian = torch.func.jacfwd(weighted)(start)[:, moving]
@@ -80,7 +110,7 @@ def newton_step(problem: Problem, state: State, options: Options, damping: float
     gradient = -jacobian.T @ weighted(start)
 
     depths = torch.zeros_like(moving)
-    depths[6 * num_frames + 2 :] = True
+    depths[num_shared:] = True
     depths = depths[moving]
     curvature = hessian.diagonal()[depths] * (1 + damping)
     seen = curvature > 0
@@ -95,12 +125,17 @@ def newton_step(problem: Problem, state: State, options: Options, damping: float
 
     update = start.clone()
     update[moving] = solution
-    twists, intrinsics, depth = torch.split(update, sizes)
+    twists, extrinsics, log_focal, alpha, depth = torch.split(update, sizes)
+    pose = twists.reshape(num_poses, 6)[pose_of]
+    if rig is not None:
+        pose = (se3.adjoint(cam_from_rig)[view_of] @ pose[..., None])[..., 0]
+    shape = state.intrinsics.shape[:-1]
     return Step(
-        pose=twists.reshape(num_frames, 6),
-        log_focal=intrinsics[0],
-        alpha=intrinsics[1],
+        pose=pose,
+        log_focal=log_focal.reshape(shape),
+        alpha=alpha.reshape(shape),
         inverse_depth=depth.reshape(num_frames, num_cells),
         predicted_drop=gradient @ solution,
         factorised=torch.tensor(True),
+        extrinsic=None if rig is None else extrinsics.reshape(num_views, 6),
     )

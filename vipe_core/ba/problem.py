@@ -6,6 +6,8 @@ cell p of the source grid, where the point behind p is seen in frame j:
     r_e(p) = project(G_j G_i^-1 (ray(p), d_i(p)); K) - target_e(p)        weighted per component by weight_e(p)
 
 with G = cam_from_world and d the inverse depth along the ray that the camera model returns (z = 1 for pinhole).
+Frames that are views of one rigid rig share its pose: G_n = cam_from_rig[view of n] rig_from_world[pose of n] (section
+3.2.6); such a problem has a `Rig`, and may have intrinsics per view.
 Units: pixels of the working image (integer pixel indices), inverse depth in 1 / world unit.
 Paper section 3.2, equations of the dense term and of the depth prior; `torch_solver.py` says how it is solved.
 """
@@ -23,6 +25,7 @@ from torch import Tensor
 from vipe_core.cameras import CameraModel
 
 Covariance = tuple[tuple[float, float], tuple[float, float]]
+NO_COVARIANCE: Covariance = ((0.0, 0.0), (0.0, 0.0))
 RobustKernel = Literal["none", "huber", "cauchy", "geman_mcclure", "tukey"]
 
 
@@ -82,18 +85,35 @@ class Edges:
 
 
 @dataclass(frozen=True, slots=True)
+class Rig:
+    """Which frames are views of a rigid rig at one instant.
+
+    Attributes:
+        pose_of_frame: (N,) int64 number of the rig pose behind each frame, 0..R-1.
+        view_of_frame: (N,) int64 which camera of the rig took it, 0..V-1.
+    """
+
+    pose_of_frame: Tensor
+    view_of_frame: Tensor
+
+
+@dataclass(frozen=True, slots=True)
 class State:
     """The unknowns.
 
     Attributes:
-        cam_from_world: (N, 4, 4) float64 rigid transforms.
+        cam_from_world: (N, 4, 4) float64 rigid transforms. Those of a rig agree with `cam_from_rig`: all frames of one
+            rig pose give the same inverse(cam_from_rig[view]) @ cam_from_world.
         inverse_depth: (N, P) float32 or float64, positive.
-        intrinsics: (K,) float64, `Camera.index_params` of the working image: (fx, fy, cx, cy[, alpha]).
+        intrinsics: (K,) float64, `Camera.index_params` of the working image: (fx, fy, cx, cy[, alpha]). Of a rig, also
+            (V, K): each view has its own.
+        cam_from_rig: (V, 4, 4) float64 of a rig, else None.
     """
 
     cam_from_world: Tensor
     inverse_depth: Tensor
     intrinsics: Tensor
+    cam_from_rig: Tensor | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,16 +121,20 @@ class Free:
     """What may move.
 
     Attributes:
-        poses: (N,) bool. At least one pose must be fixed unless there is nothing else to hold the gauge.
+        poses: (N,) bool, the same for all frames of one rig pose. At least one pose must be fixed unless there is
+            nothing else to hold the gauge.
         inverse_depth: (N,) bool, per frame.
-        focal: Whether the focal length moves (fx and fy by the same factor; log-parametrised).
+        focal: Whether the focal length moves (fx and fy by the same factor; log-parametrised); every view's by itself
+            where they have their own.
         distortion: Whether alpha of the unified model moves.
+        extrinsics: Whether `State.cam_from_rig` moves but for view 0, which holds the gauge.
     """
 
     poses: Tensor
     inverse_depth: Tensor
     focal: bool = False
     distortion: bool = False
+    extrinsics: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,25 +144,33 @@ class Priors:
     Attributes:
         inverse_depth: (N, P) prior value, or None.
         inverse_depth_weight: (N, P) information of that prior; 0 where there is none.
-        log_focal: Prior of log(fx), or None.
+        log_focal: Prior of log(fx), or None. Where views have intrinsics of their own, of each of them, or one each.
         log_focal_sigma: Its standard deviation.
+        cam_from_rig: (V, 4, 4) prior of the extrinsics, or None.
+        extrinsic_sigma: Its standard deviations: of the place in world units, of the rotation in radians.
     """
 
     inverse_depth: Tensor | None = None
     inverse_depth_weight: Tensor | None = None
-    log_focal: float | None = None
+    log_focal: float | tuple[float, ...] | None = None
     log_focal_sigma: float = 1.0
+    cam_from_rig: Tensor | None = None
+    extrinsic_sigma: tuple[float, float] = (1.0, 1.0)
 
 
 @dataclass(frozen=True, slots=True)
 class Problem:
-    """One bundle adjustment. Frames that no edge touches are left as they are."""
+    """One bundle adjustment. Frames that no edge touches are left as they are, but for those of a rig that moves.
+
+    Edges between frames of one rig pose say nothing about it: a rig pose that no other edge touches stays.
+    """
 
     camera_model: CameraModel
     grid: Grid
     edges: Edges
     free: Free
     priors: Priors = field(default_factory=Priors)
+    rig: Rig | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -193,8 +225,9 @@ class Result:
         cost: Robust cost after.
         weight_sum: Sum of these w over valid measurements at the end; `cost / weight_sum` is a mean squared residual,
             px^2.
-        intrinsics_covariance: ((var, cov), (cov, var)) of log(f) and alpha from the reduced system at the end, with
-            everything else marginalised; 0 for what was fixed, NaN where the system says nothing.
+        intrinsics_covariances: ((var, cov), (cov, var)) of log(f) and alpha from the reduced system at the end, with
+            everything else marginalised; 0 for what was fixed, NaN where the system says nothing. One, or one per view
+            where each has its own intrinsics.
     """
 
     state: State
@@ -203,7 +236,12 @@ class Result:
     initial_cost: float
     cost: float
     weight_sum: float
-    intrinsics_covariance: Covariance = ((0.0, 0.0), (0.0, 0.0))
+    intrinsics_covariances: tuple[Covariance, ...] = (NO_COVARIANCE,)
+
+    @property
+    def intrinsics_covariance(self) -> Covariance:
+        """That of the only camera, or of the first view."""
+        return self.intrinsics_covariances[0]
 
     @property
     def log_focal_sigma(self) -> float:

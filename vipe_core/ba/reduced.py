@@ -138,6 +138,80 @@ def add_twists(
 
 
 @vectorised
+def _add_one(first: Array, rows: Array, i: int, j: int, local: Array, blocks: Array) -> None:
+    """Add a block (i, j) of a symmetric matrix with its mirror image (j, i), of which the lower one is stored."""
+    if i < 0 or j < 0:
+        return
+    _add(first, rows, i, j, local, 0, 0, 6, blocks)
+    if i == j:
+        block = blocks[_slot(first, rows, i, i)]
+        for a in range(6):
+            for b in range(6):
+                block[a, b] += local[b, a]
+
+
+@vectorised
+def add_frames(
+    first: Array,
+    rows: Array,
+    blocks: Array,
+    gradient: Array,
+    turn: Array,
+    pose: Array,
+    view: Array,
+    into_first: Array,
+    into_rows: Array,
+    into: Array,
+    into_gradient: Array,
+) -> None:
+    """Take a system in the twists of frames to one in the poses and extrinsics of a rig, see `rigs.py`.
+
+    Args:
+        first, rows, blocks, gradient: The system of F frames, and one node more where intrinsics are free.
+        turn: (N, 6, 6) maps from twists of poses to those of frames.
+        pose: (N + 1,) columns of the poses in the other structure; -1 where held, and for the intrinsics.
+        view: (N + 1,) those of the extrinsics, and of the intrinsics.
+        into_first, into_rows, into, into_gradient: That structure, added to.
+    """
+    left, right, both = np.empty((6, 6)), np.empty((6, 6)), np.empty((6, 6))
+    for k in range(len(first) - 1):
+        for p in range(first[k], first[k + 1]):
+            f, block = rows[p], blocks[p]
+            # left = turn_f^T block, right = block turn_k, both = turn_f^T block turn_k.
+            for a in range(6):
+                for b in range(6):
+                    left[a, b] = right[a, b] = both[a, b] = 0.0
+            if pose[f] >= 0:
+                for c in range(6):
+                    for a in range(6):
+                        for b in range(6):
+                            left[a, b] += turn[f, c, a] * block[c, b]
+            if pose[k] >= 0:
+                for a in range(6):
+                    for c in range(6):
+                        for b in range(6):
+                            right[a, b] += block[a, c] * turn[k, c, b]
+                            both[a, b] += left[a, c] * turn[k, c, b]
+            if f == k:
+                _add(into_first, into_rows, pose[f], pose[f], both, 0, 0, 6, into)
+                _add(into_first, into_rows, view[f], view[f], block, 0, 0, 6, into)
+                # One of the mirror images: the pose is never the same unknown as the extrinsics.
+                _add(into_first, into_rows, view[f], pose[f], right, 0, 0, 6, into)
+            else:
+                _add_one(into_first, into_rows, pose[f], pose[k], both, into)
+                _add_one(into_first, into_rows, view[f], view[k], block, into)
+                _add_one(into_first, into_rows, view[f], pose[k], right, into)
+                _add_one(into_first, into_rows, pose[f], view[k], left, into)
+        if pose[k] >= 0:
+            for c in range(6):
+                for a in range(6):
+                    into_gradient[pose[k], a] += turn[k, c, a] * gradient[k, c]
+        if view[k] >= 0:
+            for a in range(6):
+                into_gradient[view[k], a] += gradient[k, a]
+
+
+@vectorised
 def damp(
     first: Array, rows: Array, direct: Array, eliminated: Array, damping: float, factor: Array, scale: Array
 ) -> None:

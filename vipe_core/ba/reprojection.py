@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from vipe_core.ba.problem import Grid, Options, Problem, State
+from vipe_core.ba.problem import Grid, Options, Problem, Rig, State
 from vipe_core.cameras import CameraModel, projection
 from vipe_core.errors import ConfigError
 from vipe_core.geometry import se3
@@ -33,6 +33,13 @@ def min_depth_factor(
     return torch.where(on_disk, min_depth_ratio * s, torch.inf)
 
 
+def cameras_of(intrinsics: Tensor, rig: Rig | None, num_frames: int) -> tuple[Tensor, Tensor]:
+    """(C, K) different intrinsics of a problem, and (N,) int64 which of them each frame has."""
+    if intrinsics.ndim == 1 or rig is None:
+        return intrinsics.reshape(1, -1), torch.zeros(num_frames, dtype=torch.int64, device=intrinsics.device)
+    return intrinsics, rig.view_of_frame.to(intrinsics.device)
+
+
 def reproject(
     camera_model: CameraModel,
     grid: Grid,
@@ -40,6 +47,7 @@ def reproject(
     source: Tensor,
     target: Tensor,
     min_depth_ratio: float = _MIN_DEPTH_RATIO,
+    rig: Rig | None = None,
 ) -> tuple[Tensor, Tensor]:
     """Where every source cell is seen in the target frame.
 
@@ -50,6 +58,7 @@ def reproject(
         source: (E,) int64 source frames.
         target: (E,) int64 target frames.
         min_depth_ratio: See `Options`.
+        rig: Says which intrinsics are of which frame where each view has its own.
 
     Returns:
         px (E, P, 2) index coordinates in the dtype of the inverse depths, finite everywhere, and valid (E, P) bool.
@@ -60,19 +69,29 @@ def reproject(
     """
     require_supported(camera_model)
     dtype, device = state.inverse_depth.dtype, state.inverse_depth.device
-    intrinsics = state.intrinsics.to(device)
+    cameras, camera_of = cameras_of(state.intrinsics.to(device), rig, len(state.cam_from_world))
     sample_px = grid.sample_px(device=device)
-    rays = projection.unproject(camera_model, intrinsics, sample_px)
-    floor = min_depth_factor(camera_model, intrinsics, sample_px, rays, min_depth_ratio).to(dtype)
+    tables = [projection.unproject(camera_model, camera, sample_px) for camera in cameras]
+    floors = [
+        min_depth_factor(camera_model, camera, sample_px, rays, min_depth_ratio).to(dtype)
+        for camera, rays in zip(cameras, tables, strict=True)
+    ]
     target_from_source = se3.relative(state.cam_from_world[target], state.cam_from_world[source]).to(dtype)
-    rays, params = rays.to(dtype), intrinsics.to(dtype)
+    rays_of, floor_of, params_of = torch.stack(tables).to(dtype), torch.stack(floors), cameras.to(dtype)
+    alone = len(cameras) == 1
 
-    px = torch.empty(len(source), len(rays), 2, dtype=dtype, device=device)
-    valid = torch.empty(len(source), len(rays), dtype=torch.bool, device=device)
-    batch = max(_BATCH_CELLS // max(len(rays), 1), 1)
+    cells = grid.num_cells
+    px = torch.empty(len(source), cells, 2, dtype=dtype, device=device)
+    valid = torch.empty(len(source), cells, dtype=torch.bool, device=device)
+    batch = max(_BATCH_CELLS // max(cells, 1), 1)
     for start in range(0, len(source), batch):
         edges = slice(start, start + batch)
         transform = target_from_source[edges]
+        seen_from, seen_in = camera_of[source[edges]], camera_of[target[edges]]
+        rays = rays_of[0] if alone else rays_of[seen_from]
+        floor = floor_of[0] if alone else floor_of[seen_from]
+        # One column per edge, so that the camera functions take them as numbers.
+        params = params_of[0] if alone else params_of[seen_in].T[..., None]
         points = rays @ transform[:, :3, :3].mT
         points = torch.addcmul(points, state.inverse_depth[source[edges]][..., None], transform[:, None, :3, 3])
         px[edges], imaged = projection.project(camera_model, params, points)
@@ -88,6 +107,8 @@ def residuals(problem: Problem, state: State, min_depth_ratio: float = _MIN_DEPT
         projected.
     """
     edges = problem.edges
-    px, projected = reproject(problem.camera_model, problem.grid, state, edges.source, edges.target, min_depth_ratio)
+    px, projected = reproject(
+        problem.camera_model, problem.grid, state, edges.source, edges.target, min_depth_ratio, problem.rig
+    )
     valid = projected & (edges.weight.to(px.device) > 0).any(-1)
     return torch.where(valid[..., None], px - edges.target_px.to(px), 0), valid

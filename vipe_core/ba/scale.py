@@ -76,7 +76,13 @@ def _squared(problem: Problem, state: State, chosen: Tensor) -> Iterator[tuple[T
         here = chosen[start : start + batch_size].to(edges.source.device)
         batch = Edges(edges.source[here], edges.target[here], edges.target_px[here], edges.weight[here])
         px, projected = reproject(
-            problem.camera_model, problem.grid, state, batch.source, batch.target, Options().min_depth_ratio
+            problem.camera_model,
+            problem.grid,
+            state,
+            batch.source,
+            batch.target,
+            Options().min_depth_ratio,
+            problem.rig,
         )
         weight = batch.weight.to(device).clamp_min(0)
         error = torch.where(weight > 0, px - batch.target_px.to(device), 0)

@@ -42,12 +42,14 @@ class Step:
     """An update of the state.
 
     Attributes:
-        pose: (N, 6) float64 left twists of cam_from_world (translation, rotation).
-        log_focal: 0-dim float64.
-        alpha: 0-dim float64.
+        pose: (N, 6) float64 left twists of cam_from_world (translation, rotation); of a rig, what the rig poses
+            contribute to it.
+        log_focal: 0-dim float64; (V,) where each view has its own intrinsics.
+        alpha: 0-dim float64; (V,) likewise.
         inverse_depth: (N, P), before clamping.
         predicted_drop: 0-dim float64, g^T step: how much the undamped quadratic model expects to gain.
         factorised: 0-dim bool, whether the reduced system was positive definite; otherwise the step is not finite.
+        extrinsic: (V, 6) float64 left twists of cam_from_rig, after those of the poses, or None without a rig.
     """
 
     pose: Tensor
@@ -56,6 +58,7 @@ class Step:
     inverse_depth: Tensor
     predicted_drop: Tensor
     factorised: Tensor
+    extrinsic: Tensor | None = None
 
 
 class Linearised(Protocol):
@@ -95,5 +98,5 @@ class Solver(Protocol[System]):
         """The state after a step. Whatever the step does not touch keeps its bits."""
 
     def intrinsics_covariance(self, system: System, damping: float) -> Tensor:
-        """(2, 2) covariance of log f and alpha with everything else marginalised: 0 for what is held, NaN where the
-        damped system is singular."""
+        """(C, 2, 2) covariance of log f and alpha of each camera with everything else marginalised: 0 for what is held,
+        NaN where the damped system is singular."""

@@ -19,6 +19,10 @@ X = R ray + d t and J_X = d project / d X the columns are
 
     tau: [ d J_X ,  X x J_X ]        d: J_X t        k: J_X R d ray/dk + d project/dk
 
+Rigs. What is said of the twists of frames is said of the poses and extrinsics behind them (`rigs.py`): the small matrix
+of a source frame, see below, is taken to them before it is scattered. Where every view has intrinsics of its own, an
+edge has 6 + n rows of its own, the target's intrinsics being among them, and k is the source's.
+
 Elimination. A depth is touched only by the edges that leave its frame. Per cell of source frame i with D edges, let
 e_m = J_tau^T J_d (6 rows of edge m), f = sum J_k^T J_d, v = -sum J_d r, C = sum J_d^2 + prior. Then everything that
 frame i says about (tau_1..tau_D, k, right-hand side) is one small matrix,
@@ -50,7 +54,8 @@ from torch import Tensor
 from vipe_core.ba import robust
 from vipe_core.ba.plan import Chunk, build_plan
 from vipe_core.ba.problem import Options, Problem, State
-from vipe_core.ba.reprojection import min_depth_factor
+from vipe_core.ba.reprojection import cameras_of, min_depth_factor
+from vipe_core.ba.rigs import extrinsic_prior, moved_poses, turns_of
 from vipe_core.ba.solver import ALPHA_RANGE, MAX_LOG_FOCAL_STEP, MIN_CURVATURE, Cost, Step
 from vipe_core.cameras import projection
 from vipe_core.geometry import se3
@@ -91,7 +96,8 @@ class _View:
 
 @dataclass(frozen=True, slots=True)
 class _Eliminated:
-    """Factors of a chunk's elimination: x (F, 6 D + n + 1, P), root_q (F, P), adjoint (F, D, 6, 6)."""
+    """Factors of a chunk's elimination: x (F, 6 D + n + 1, P), with n D more after the first 6 D where every view has
+    intrinsics of its own; root_q (F, P), adjoint (F, D, 6, 6)."""
 
     x: Tensor
     root_q: Tensor
@@ -118,23 +124,30 @@ class Linearisation:
 
 
 class _Geometry:
-    """What depends on poses and intrinsics only: transforms per edge, rays per cell."""
+    """What depends on poses and intrinsics only: transforms per edge, rays per camera and cell."""
 
-    def __init__(self, problem: Problem, options: Options, state: State, sample_px: Tensor) -> None:
-        model, dtype, intrinsics = problem.camera_model, state.inverse_depth.dtype, state.intrinsics
+    def __init__(self, problem: Problem, options: Options, state: State, sample_px: Tensor, cameras: Tensor) -> None:
+        model, dtype = problem.camera_model, state.inverse_depth.dtype
         source_from_world = state.cam_from_world[problem.edges.source]
         transform = se3.relative(state.cam_from_world[problem.edges.target], source_from_world)
         self.adjoint = se3.adjoint(transform)
+        self.turn = turns_of(problem, state)
         self.rotation = transform[:, :3, :3].to(dtype)
         self.translation = transform[:, :3, 3:].to(dtype)
-        rays = projection.unproject(model, intrinsics, sample_px)
-        self.rays = rays.mT.to(dtype).contiguous()
-        by_intrinsics = projection.unproject_jacobian(model, intrinsics, sample_px)
-        self.rays_by_intrinsics = by_intrinsics.permute(2, 1, 0).to(dtype).contiguous()
-        self.min_s = min_depth_factor(model, intrinsics, sample_px, rays, options.min_depth_ratio).to(dtype)
-        self.focal = intrinsics[:2, None].to(dtype)
-        self.centre = intrinsics[2:4, None].to(dtype)
-        self.alpha = intrinsics[4].to(dtype) if model == "mei" else None
+        tables, slopes, floors = [], [], []
+        for camera in cameras:
+            rays = projection.unproject(model, camera, sample_px)
+            floors.append(min_depth_factor(model, camera, sample_px, rays, options.min_depth_ratio).to(dtype))
+            slopes.append(projection.unproject_jacobian(model, camera, sample_px).permute(2, 1, 0).to(dtype))
+            tables.append(rays.mT.to(dtype))
+        # (C, 3, P), (C, n, 3, P), (C, P).
+        self.rays = torch.stack(tables).contiguous()
+        self.rays_by_intrinsics = torch.stack(slopes).contiguous()
+        self.min_s = torch.stack(floors)
+        # (C, 2, 1) and (C, 1, 1).
+        self.focal = cameras[:, :2, None].to(dtype)
+        self.centre = cameras[:, 2:4, None].to(dtype)
+        self.alpha = cameras[:, 4:, None].to(dtype) if model == "mei" else None
 
 
 class TorchSolver:
@@ -143,14 +156,14 @@ class TorchSolver:
     def __init__(self, problem: Problem, options: Options, state: State) -> None:
         self.problem, self.options = problem, options
         self.dtype, self.device = state.inverse_depth.dtype, state.inverse_depth.device
-        self.plan = plan = build_plan(problem, self.device)
-        self.intrinsics_free = (plan.focal_column is not None, plan.alpha_column is not None)
+        cameras, self._camera_of = cameras_of(state.intrinsics, problem.rig, len(state.cam_from_world))
+        self._num_cameras = len(cameras)
+        self.plan = plan = build_plan(problem, self._camera_of, self._num_cameras, self.device)
+        self.intrinsics_free = (0 in plan.free_intrinsics, 1 in plan.free_intrinsics)
         self.anything_free = plan.num_columns > 0 or plan.any_depth_free
         self._sample_px = problem.grid.sample_px(device=self.device)
         median = state.inverse_depth.median()
         self._depth_range = (options.min_inverse_depth * median, options.max_inverse_depth * median)
-        # (log f, alpha) of the camera functions -> those that are free.
-        self._free_intrinsics = [i for i, free in enumerate(self.intrinsics_free) if free]
         cells = len(problem.edges.source) * problem.grid.num_cells
         keep_bytes = _CPU_KEEP_BYTES if self.device.type == "cpu" else _GPU_KEEP_BYTES
         self._keep = cells * 12 * self.dtype.itemsize <= keep_bytes
@@ -171,23 +184,35 @@ class TorchSolver:
         return found
 
     def _geometry(self, state: State) -> _Geometry:
-        return _Geometry(self.problem, self.options, state, self._sample_px)
+        cameras = state.intrinsics.reshape(self._num_cameras, -1)
+        return _Geometry(self.problem, self.options, state, self._sample_px, cameras)
+
+    def _cameras(self, chunk: Chunk) -> tuple[Tensor | int, Tensor | int]:
+        """Which cameras the sources (F,) and the targets (F, D) of a chunk have; 0 where there is one only."""
+        if self._num_cameras == 1:
+            return 0, 0
+        return self._camera_of[chunk.frames], self._camera_of[chunk.targets]
 
     def _view(self, chunk: Chunk, measured: _Measured, state: State, geometry: _Geometry) -> _View:
         rotation, translation = geometry.rotation[chunk.edges], geometry.translation[chunk.edges]
-        points = rotation @ geometry.rays
+        at_source, at_target = self._cameras(chunk)
+        rays, least = geometry.rays[at_source], geometry.min_s[at_source]
+        if self._num_cameras > 1:
+            rays, least = rays[:, None], least[:, None]
+        points = rotation @ rays
         points.addcmul_(translation, state.inverse_depth[chunk.frames][:, None, None])
         s, norm = points[:, :, 2:], None
-        valid = s[:, :, 0] > geometry.min_s
+        valid = s[:, :, 0] > least
         if geometry.alpha is not None:
+            alpha = geometry.alpha[at_target]
             norm = (points * points).sum(2, keepdim=True).sqrt()
-            s = s + geometry.alpha * norm
-            beyond = (geometry.alpha > 1) & (geometry.alpha * points[:, :, 2] <= -norm[:, :, 0])
-            valid = (s[:, :, 0] > geometry.min_s) & ~beyond
+            s = s + alpha * norm
+            beyond = (alpha[..., 0] > 1) & (alpha[..., 0] * points[:, :, 2] <= -norm[:, :, 0])
+            valid = (s[:, :, 0] > least) & ~beyond
             norm = torch.where(valid[:, :, None], norm, 1)
         s = torch.where(valid[:, :, None], s, 1)
         xy = points[:, :, :2] / s
-        error = torch.addcmul(geometry.centre - measured.target_px, xy, geometry.focal)
+        error = torch.addcmul(geometry.centre[at_target] - measured.target_px, xy, geometry.focal[at_target])
         weighted = error.mul_(measured.root_weight).mul_(valid[:, :, None])
         squared = (weighted * weighted).sum(2).div_(measured.max_weight.clamp_min(torch.finfo(self.dtype).tiny))
         return _View(points, rotation, translation, s, norm, xy, valid, weighted, squared)
@@ -218,8 +243,15 @@ class TorchSolver:
     def _cost(self, sums: Tensor, state: State) -> Cost:
         priors, prior_cost = self.problem.priors, sums[3]
         if priors.log_focal is not None and self.intrinsics_free[0]:
-            prior_cost = prior_cost + ((state.intrinsics[0].log() - priors.log_focal) / priors.log_focal_sigma) ** 2
+            off = state.intrinsics[..., 0].log() - state.intrinsics.new_tensor(priors.log_focal)
+            prior_cost = prior_cost + (off / priors.log_focal_sigma).square().sum()
+        extrinsic = self._extrinsic_prior(state)
+        if extrinsic is not None:
+            prior_cost = prior_cost + extrinsic[0].square().sum()
         return Cost(sums[0], sums[1], sums[2] - sums[1], prior_cost)
+
+    def _extrinsic_prior(self, state: State) -> tuple[Tensor, Tensor, Tensor] | None:
+        return extrinsic_prior(self.problem.priors, state) if self.problem.free.extrinsics else None
 
     def _depth_prior(self, chunk: Chunk, state: State) -> tuple[Tensor, Tensor] | None:
         """Information (F, P) and prior minus state (F, P)."""
@@ -238,8 +270,10 @@ class TorchSolver:
         """Scaled Jacobian rows of tau and intrinsics, then the negative residual; and the scaled J_X.
 
         Returns:
-            (F, D, 6 + n + 1, 2, P) and (F, D, 3, 2, P).
+            (F, D, 6 + n + 1, 2, P), with n more after the first 6, the target's, where every view has intrinsics of its
+            own; and (F, D, 3, 2, P).
         """
+        at_source, at_target = self._cameras(chunk)
         scale = measured.root_weight * view.valid[:, :, None]
         residual = view.weighted
         slope = robust.root_slope(self.options.robust, scale_px, view.squared)
@@ -247,12 +281,12 @@ class TorchSolver:
             scale = scale * slope[:, :, None]
             residual = residual * slope[:, :, None]
         # J_X = scale f / s (1 - xy slope^T), slope = e_z + alpha X / |X|.
-        diagonal = scale * geometry.focal / view.s
+        diagonal = scale * geometry.focal[at_target] / view.s
         outer = -diagonal * view.xy
         frames, degree, _, cells = view.points.shape
         by_point = torch.empty(frames, degree, 3, 2, cells, dtype=self.dtype, device=self.device)
         if geometry.alpha is not None and view.norm is not None:
-            bend = geometry.alpha * view.points / view.norm
+            bend = geometry.alpha[at_target] * view.points / view.norm
             torch.mul(bend[:, :, :, None], outer[:, :, None], out=by_point)
             by_point[:, :, 2] += outer
             by_point[:, :, 0, 0] += diagonal[:, :, 0]
@@ -264,7 +298,8 @@ class TorchSolver:
             by_point[:, :, 1, 1] = diagonal[:, :, 1]
             by_point[:, :, 2] = outer
 
-        num_rows = 7 + len(self._free_intrinsics)
+        each, apart = len(self.plan.free_intrinsics), self._num_cameras > 1
+        num_rows = 7 + each + each * apart
         rows = torch.empty(frames, degree, num_rows, 2, cells, dtype=self.dtype, device=self.device)
         torch.mul(by_point, state.inverse_depth[chunk.frames][:, None, None, None], out=rows[:, :, :3])
         for k in range(3):
@@ -272,12 +307,17 @@ class TorchSolver:
             row = rows[:, :, 3 + k]
             torch.mul(by_point[:, :, b], view.points[:, :, a, None], out=row)
             row.addcmul_(by_point[:, :, a], view.points[:, :, b, None], value=-1)
-        for row_index, intrinsic in enumerate(self._free_intrinsics):
-            ray = view.rotation @ geometry.rays_by_intrinsics[intrinsic]
-            row = rows[:, :, 6 + row_index]
-            torch.sum(by_point * ray[:, :, :, None], dim=2, out=row)
+        for index, intrinsic in enumerate(self.plan.free_intrinsics):
+            by_intrinsic = geometry.rays_by_intrinsics[at_source, intrinsic]
+            ray = view.rotation @ (by_intrinsic[:, None] if apart else by_intrinsic)
             # Both camera derivatives are multiples of xy f: s outer = -scale f xy.
-            row.addcmul_(outer, view.s if intrinsic == 0 or view.norm is None else -view.norm, value=-1)
+            share = view.s if intrinsic == 0 or view.norm is None else -view.norm
+            if apart:
+                torch.mul(outer, -share, out=rows[:, :, 6 + index])
+            row = rows[:, :, 6 + each * apart + index]
+            torch.sum(by_point * ray[:, :, :, None], dim=2, out=row)
+            if not apart:
+                row.addcmul_(outer, share, value=-1)
         torch.neg(residual, out=rows[:, :, -1])
         return rows, by_point
 
@@ -287,15 +327,17 @@ class TorchSolver:
         frames, degree, num_rows, _, cells = rows.shape
         translation = geometry.translation[chunk.edges]
         by_depth = (translation.mT @ by_point.flatten(3)).view(frames, degree, 2, cells)
-        tail = num_rows - 6
-        x = torch.empty(frames, 6 * degree + tail, cells, dtype=self.dtype, device=self.device)
+        tail = 1 + len(self.plan.free_intrinsics)
+        own = num_rows - tail
+        x = torch.empty(frames, own * degree + tail, cells, dtype=self.dtype, device=self.device)
         first, second = by_depth[:, :, None, 0], by_depth[:, :, None, 1]
-        twist = x[:, : 6 * degree].view(frames, degree, 6, cells)
-        torch.mul(rows[:, :, :6, 0], first, out=twist)
-        twist.addcmul_(rows[:, :, :6, 1], second)
-        shared = rows[:, :, 6:, 0] * first
-        shared.addcmul_(rows[:, :, 6:, 1], second)
-        torch.sum(shared, dim=1, out=x[:, 6 * degree :])
+        for start, stop in ((0, 6), (6, own)):
+            part = x[:, start * degree : stop * degree].view(frames, degree, stop - start, cells)
+            torch.mul(rows[:, :, start:stop, 0], first, out=part)
+            part.addcmul_(rows[:, :, start:stop, 1], second)
+        shared = rows[:, :, own:, 0] * first
+        shared.addcmul_(rows[:, :, own:, 1], second)
+        torch.sum(shared, dim=1, out=x[:, own * degree :])
         curvature = (by_depth * by_depth).sum(dim=(1, 2))
         prior = self._depth_prior(chunk, state)
         if prior is not None:
@@ -325,11 +367,14 @@ class TorchSolver:
             self._add_cost(sums, chunk, measured, view, state, scale_px)
             rows, by_point = self._rows(chunk, view, measured, state, geometry, scale_px)
             flat = rows.flatten(3)
-            adjoint = geometry.adjoint[chunk.edges]
-            _scatter(direct, chunk, _border(flat @ flat.mT), adjoint)
+            adjoint, turn = geometry.adjoint[chunk.edges], None
+            if geometry.turn is not None:
+                turn = torch.cat((geometry.turn[chunk.frames][:, None], geometry.turn[chunk.targets]), dim=1)
+            tail = 1 + len(self.plan.free_intrinsics)
+            _scatter(direct, chunk, _border(flat @ flat.mT, tail), adjoint, turn)
             if chunk.depth_free:
                 factor = self._eliminate(chunk, rows, by_point, geometry, state)
-                _scatter(eliminated, chunk, (factor.x @ factor.x.mT).double(), adjoint)
+                _scatter(eliminated, chunk, (factor.x @ factor.x.mT).double(), adjoint, turn)
                 if self._keep:
                     kept.append((chunk, factor))
 
@@ -343,13 +388,22 @@ class TorchSolver:
                     rows, by_point = self._rows(chunk, view, measured, state, geometry, scale_px)
                     yield chunk, self._eliminate(chunk, rows, by_point, geometry, state)
 
-        priors, column = self.problem.priors, self.plan.focal_column
-        if priors.log_focal is not None and column is not None:
+        priors = self.problem.priors
+        if priors.log_focal is not None and self.intrinsics_free[0]:
             information = 1 / priors.log_focal_sigma**2
-            pull = information * (priors.log_focal - state.intrinsics[0].log())
-            direct[column, column] += information
-            direct[column, -2] += pull
-            direct[-2, column] += pull
+            pull = information * (state.intrinsics.new_tensor(priors.log_focal) - state.intrinsics[..., 0].log())
+            columns = self.plan.intrinsic_columns[:, 0]
+            direct[columns, columns] += information
+            direct[columns, -2] += pull.reshape(-1)
+            direct[-2, columns] += pull.reshape(-1)
+        extrinsic = self._extrinsic_prior(state)
+        if extrinsic is not None:
+            _, hessian, gradient = extrinsic
+            columns = self.plan.view_columns
+            right = torch.full_like(columns, self.plan.num_columns)
+            direct.index_put_((columns[:, :, None], columns[:, None, :]), hessian, accumulate=True)
+            direct.index_put_((columns, right), gradient, accumulate=True)
+            direct.index_put_((right, columns), gradient, accumulate=True)
         return Linearisation(direct[:-1, :-1], eliminated[:-1, :-1], state, self._cost(sums, state), factors)
 
     # -- solution ------------------------------------------------------------------------------------------------
@@ -372,78 +426,128 @@ class TorchSolver:
         scale, factor, gradient, factorised = self._factorise(system, damping)
         solution = torch.cholesky_solve((gradient * scale)[:, None], factor)[:, 0] * scale
         solution = torch.where(factorised, solution, torch.nan)
-        zero = solution.new_zeros(1)
-        log_focal, alpha = zero[0], zero[0]
-        intrinsics = []
-        if (column := self.plan.focal_column) is not None:
-            log_focal = solution[column].clamp(-MAX_LOG_FOCAL_STEP, MAX_LOG_FOCAL_STEP)
-            solution[column] = log_focal
-            intrinsics.append(log_focal)
-        if (column := self.plan.alpha_column) is not None:
-            current = system.state.intrinsics[4]
-            alpha = (current + solution[column]).clamp(*ALPHA_RANGE) - current
-            solution[column] = alpha
-            intrinsics.append(alpha)
-        pose = torch.cat((solution, zero, zero))[self.plan.pose_columns]
+        state, free = system.state, self.plan.free_intrinsics
+        change = solution.new_zeros(self._num_cameras, 2)
+        for index, intrinsic in enumerate(free):
+            columns = self.plan.intrinsic_columns[:, index]
+            if intrinsic == 0:
+                change[:, 0] = solution[columns].clamp(-MAX_LOG_FOCAL_STEP, MAX_LOG_FOCAL_STEP)
+            else:
+                current = state.intrinsics[..., 4].reshape(-1)
+                change[:, 1] = (current + solution[columns]).clamp(*ALPHA_RANGE) - current
+            solution[columns] = change[:, intrinsic]
+        padded = torch.cat((solution, solution.new_zeros(2)))
+        pose, extrinsic = padded[self.plan.pose_columns], None
+        total = pose
+        if (turn := turns_of(self.problem, state)) is not None and self.problem.rig is not None:
+            pose = (turn @ pose[..., None])[..., 0]
+            extrinsic = padded[self.plan.view_columns]
+            total = pose + extrinsic[self.problem.rig.view_of_frame]
         predicted_drop = system.direct[:-1, -1] @ solution
 
-        depth = torch.zeros_like(system.state.inverse_depth)
-        shared = torch.stack([-value for value in intrinsics] + [torch.ones_like(zero[0])])
+        depth = torch.zeros_like(state.inverse_depth)
+        moved = -change[:, list(free)]
+        one = solution.new_ones(1)
         for chunk, factors in system.factors():
-            source = pose[chunk.frames][:, None, :, None]
-            twist = (factors.adjoint @ source)[..., 0] - pose[chunk.targets]
-            combination = torch.cat((twist.flatten(1), shared.expand(len(twist), -1)), dim=1).to(self.dtype)
+            source = total[chunk.frames][:, None, :, None]
+            twist = (factors.adjoint @ source)[..., 0] - total[chunk.targets]
+            at_source, at_target = self._cameras(chunk)
+            parts = [twist.flatten(1)]
+            if self._num_cameras > 1:
+                parts.append(moved[at_target].flatten(1))
+            parts += [moved[at_source].expand(len(twist), -1), one.expand(len(twist), -1)]
+            combination = torch.cat(parts, dim=1).to(self.dtype)
             scaled_step = (combination[:, None] @ factors.x)[:, 0].div_(1 + damping)
             predicted_drop = predicted_drop + (scaled_step * factors.x[:, -1]).sum(-1).double().sum()
             depth[chunk.frames] = scaled_step * factors.root_q
-        return Step(pose, log_focal, alpha, depth, predicted_drop, factorised)
+        shape = state.intrinsics.shape[:-1]
+        log_focal, alpha = change[:, 0].reshape(shape), change[:, 1].reshape(shape)
+        return Step(pose, log_focal, alpha, depth, predicted_drop, factorised, extrinsic)
 
     def retract(self, state: State, step: Step) -> State:
         """The state after a step. Whatever the step does not touch keeps its bits."""
         intrinsics = state.intrinsics.clone()
-        intrinsics[:2] *= step.log_focal.exp()
-        if self.plan.alpha_column is not None:
-            intrinsics[4] += step.alpha
+        intrinsics[..., :2] *= step.log_focal.exp()[..., None]
+        if self.intrinsics_free[1]:
+            intrinsics[..., 4] += step.alpha
         inverse_depth = state.inverse_depth.clone()
         for chunk in self.plan.chunks:
             if chunk.depth_free:
                 moved = state.inverse_depth[chunk.frames] + step.inverse_depth[chunk.frames]
                 inverse_depth[chunk.frames] = moved.clamp(*self._depth_range)
-        return State(se3.exp(step.pose) @ state.cam_from_world, inverse_depth, intrinsics)
+        cam_from_world, cam_from_rig = moved_poses(self.problem, state, step)
+        return State(cam_from_world, inverse_depth, intrinsics, cam_from_rig)
 
     def intrinsics_covariance(self, system: Linearisation, damping: float) -> Tensor:
         """See `Solver.intrinsics_covariance`."""
         scale, factor, _, factorised = self._factorise(system, damping)
-        at = self._free_intrinsics
-        columns = [c for c in (self.plan.focal_column, self.plan.alpha_column) if c is not None]
-        units = torch.zeros(len(scale), len(columns), dtype=scale.dtype, device=scale.device)
-        units[columns, range(len(columns))] = scale[columns]
-        found = scale[columns][:, None] * torch.cholesky_solve(units, factor)[columns]
-        covariance = torch.zeros(2, 2, dtype=torch.float64, device=scale.device)
-        sound = factorised & (scale[columns] > 0).all()
-        covariance[torch.tensor(at)[:, None], torch.tensor(at)] = torch.where(sound, found, torch.nan)
+        columns = self.plan.intrinsic_columns
+        cameras, each = columns.shape
+        units = torch.zeros(len(scale), columns.numel(), dtype=scale.dtype, device=scale.device)
+        flat = columns.flatten()
+        units[flat, torch.arange(len(flat), device=flat.device)] = scale[flat]
+        solved = scale[flat][:, None] * torch.cholesky_solve(units, factor)[flat]
+        found = solved.reshape(cameras, each, cameras, each).diagonal(dim1=0, dim2=2).permute(2, 0, 1)
+        sound = factorised & (scale[columns] > 0).all(-1)[:, None, None]
+        covariance = torch.zeros(cameras, 2, 2, dtype=torch.float64, device=scale.device)
+        at = torch.tensor(self.plan.free_intrinsics, device=scale.device)
+        covariance[:, at[:, None], at] = torch.where(sound, found, torch.nan)
         return covariance
 
 
-def _border(per_edge: Tensor) -> Tensor:
-    """(F, D, 6 + t, 6 + t) products per edge -> (F, 6 D + t, 6 D + t) float64: twists per edge, the tail shared."""
+def _border(per_edge: Tensor, tail: int) -> Tensor:
+    """Products of the rows of each edge to one matrix per frame, with twists per edge and the tail shared.
+
+    Args:
+        per_edge: (F, D, w + tail, w + tail): w >= 6 rows that the edge has for itself, and those of the tail.
+
+    Returns:
+        (F, w D + tail, w D + tail) float64; the first 6 rows of each edge, then what else they have, then the tail.
+    """
     frames, degree, width, _ = per_edge.shape
     per_edge = per_edge.double()
-    twists = 6 * degree
-    size = twists + width - 6
+    own = width - tail
+    apart = own * degree
+    size = apart + tail
     matrix = torch.zeros(frames, size, size, dtype=torch.float64, device=per_edge.device)
-    blocks = matrix[:, :twists, :twists].view(frames, degree, 6, degree, 6)
-    blocks.diagonal(dim1=1, dim2=3).copy_(per_edge[:, :, :6, :6].permute(0, 2, 3, 1))
-    matrix[:, :twists, twists:] = per_edge[:, :, :6, 6:].flatten(1, 2)
-    matrix[:, twists:, :twists] = matrix[:, :twists, twists:].mT
-    matrix[:, twists:, twists:] = per_edge[:, :, 6:, 6:].sum(1)
+    blocks = matrix[:, :apart, :apart].view(frames, degree, own, degree, own)
+    blocks.diagonal(dim1=1, dim2=3).copy_(per_edge[:, :, :own, :own].permute(0, 2, 3, 1))
+    matrix[:, :apart, apart:] = per_edge[:, :, :own, own:].flatten(1, 2)
+    matrix[:, apart:, :apart] = matrix[:, :apart, apart:].mT
+    matrix[:, apart:, apart:] = per_edge[:, :, own:, own:].sum(1)
+    if own > 6:
+        number = torch.arange(apart, device=per_edge.device).view(degree, own)
+        rest = torch.arange(apart, size, device=per_edge.device)
+        order = torch.cat((number[:, :6].flatten(), number[:, 6:].flatten(), rest))
+        matrix = matrix[:, order][:, :, order]
     return matrix
 
 
-def _scatter(total: Tensor, chunk: Chunk, matrix: Tensor, adjoint: Tensor) -> None:
-    """total += L^T matrix L with L = [-Ad | 1], in the columns of the chunk."""
+def _scatter(total: Tensor, chunk: Chunk, matrix: Tensor, adjoint: Tensor, turn: Tensor | None) -> None:
+    """total += L^T matrix L with L = [-Ad | 1], in the columns of the chunk.
+
+    Args:
+        turn: (F, 1 + D, 6, 6) maps from the twists of rig poses to those of the source and the targets, of a rig.
+    """
     twists = 6 * chunk.degree
     to_source = matrix[:, :, :twists] @ -adjoint.flatten(1, 2)
     source = -adjoint.flatten(1, 2).mT @ to_source[:, :twists]
     local = torch.cat((torch.cat((source, to_source.mT), dim=2), torch.cat((to_source, matrix), dim=2)), dim=1)
+    if turn is not None:
+        local = _to_rig(local, turn, len(chunk.columns[0]))
     total.index_put_((chunk.columns[:, :, None], chunk.columns[:, None, :]), local, accumulate=True)
+
+
+def _to_rig(local: Tensor, turn: Tensor, width: int) -> Tensor:
+    """K^T local K with K from poses, and extrinsics where `width` has room for them, to the twists of frames."""
+    frames, size, _ = local.shape
+    twists = 6 * turn.shape[1]
+    by_pose = local.new_zeros(frames, twists, twists)
+    blocks = by_pose.view(frames, turn.shape[1], 6, turn.shape[1], 6)
+    blocks.diagonal(dim1=1, dim2=3).copy_(turn.permute(0, 2, 3, 1))
+    rest = torch.eye(size, dtype=local.dtype, device=local.device).expand(frames, -1, -1)
+    parts = [torch.nn.functional.pad(by_pose, (0, 0, 0, size - twists))]
+    # Extrinsics are twists of the frames themselves; without them, only what is behind the twists follows.
+    parts.append(rest if width > size else rest[:, :, twists:])
+    to_frames = torch.cat(parts, dim=2)
+    return to_frames.mT @ local @ to_frames

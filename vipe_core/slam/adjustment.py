@@ -16,7 +16,7 @@ import torch
 from numpy.typing import NDArray
 
 from vipe_core.ba import robust_scale_px, solve
-from vipe_core.ba.problem import Free, Grid, Options, Priors, Problem, Result, RobustKernel, State, Status
+from vipe_core.ba.problem import Free, Grid, Options, Priors, Problem, Result, Rig, RobustKernel, State, Status
 from vipe_core.slam.graph import Graph
 from vipe_core.slam.keyframes import KeyframeMap
 from vipe_core.slam.settings import SlamSettings
@@ -79,12 +79,26 @@ class FocalPrior:
     Attributes:
         rivals: Other values of log(fx) for which there is evidence.
         same_lens: The other intrinsics are known as well and held.
+        held: The focal length is, too: the camera is given, and nothing of it is adjusted.
+        of_views: In place of `log_focal` where every view of a rig has its own.
     """
 
     log_focal: float
     sigma: float
     rivals: tuple[float, ...] = ()
     same_lens: bool = False
+    held: bool = False
+    of_views: tuple[float, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class ExtrinsicPrior:
+    """What is known of a rig before: (V, 4, 4) cam_from_rig, and standard deviations of a camera's place, in the same
+    units, and of its rotation, radians."""
+
+    cam_from_rig: NDArray[np.float64]
+    place_sigma: float
+    rotation_sigma: float
 
 
 class Adjuster:
@@ -92,12 +106,21 @@ class Adjuster:
 
     Args:
         focal_prior: Holds log(fx) softly whenever the focal length is free.
+        extrinsic_prior: Holds the extrinsics of a rig softly; None where they are not refined.
 
     Attributes:
         alive: Called before every solve: a sign of life for a supervisor. What it raises ends the adjustment.
     """
 
-    def __init__(self, settings: SlamSettings, device: torch.device, focal_prior: FocalPrior, scale_px: float) -> None:
+    def __init__(
+        self,
+        settings: SlamSettings,
+        device: torch.device,
+        focal_prior: FocalPrior,
+        scale_px: float,
+        extrinsic_prior: ExtrinsicPrior | None = None,
+    ) -> None:
+        self.extrinsic_prior = extrinsic_prior
         self.settings = settings
         self.device = device
         self.focal_prior = focal_prior
@@ -118,12 +141,15 @@ class Adjuster:
         edges: Sequence[tuple[int, int]] | None = None,
         free_focal: bool = False,
         free_depth: bool = True,
+        free_extrinsics: bool = False,
     ) -> Result | None:
         """Adjust the keyframes `frames` with the edges among them; writes the result into `keyframes`.
 
         Args:
-            fixed_poses: Keyframes of `frames` whose poses hold the gauge.
+            frames: Of a rig, all views of an instant or none.
+            fixed_poses: Keyframes of `frames` whose poses hold the gauge; of a rig, one per instant is enough.
             edges: Use these edges only.
+            free_extrinsics: Of a rig, adjust its extrinsics too; `frames` are all keyframes then.
 
         Returns:
             The last solve, or None when nothing could be solved and the map is as it was.
@@ -134,6 +160,8 @@ class Adjuster:
         problem, state = self._pose_problem(
             keyframes, graph, frames, fixed_poses, edges, free_focal=free_focal, free_depth=free_depth
         )
+        if free_extrinsics:
+            problem = self._with_free_extrinsics(problem, keyframes)
         result = self.anneal(problem, state, schedule)
         if result is None:
             return None
@@ -143,7 +171,24 @@ class Adjuster:
             keyframes.set_pose(k, new_poses[row])
             keyframes.set_depth(k, new_depths[row])
         keyframes.intrinsics = result.state.intrinsics.cpu().numpy().astype(np.float64)
+        if free_extrinsics and result.state.cam_from_rig is not None:
+            keyframes.cam_from_rig = result.state.cam_from_rig.cpu().numpy()
         return result
+
+    def _with_free_extrinsics(self, problem: Problem, keyframes: KeyframeMap) -> Problem:
+        """Extrinsics are held softly where they were given, by sigmas of the same currency as the focal length's."""
+        prior = self.extrinsic_prior
+        if prior is None or keyframes.cam_from_rig is None:
+            return problem
+        given = prior.cam_from_rig.copy()
+        given[:, :3, 3] /= keyframes.rig_units
+        inflation = self.settings.focal_sigma_inflation
+        sigmas = (prior.place_sigma / keyframes.rig_units / inflation, prior.rotation_sigma / inflation)
+        return replace(
+            problem,
+            free=replace(problem.free, extrinsics=True),
+            priors=replace(problem.priors, cam_from_rig=torch.from_numpy(given), extrinsic_sigma=sigmas),
+        )
 
     def probe(
         self,
@@ -172,7 +217,8 @@ class Adjuster:
         free_depth: bool,
     ) -> tuple[Problem, State]:
         number = {k: row for row, k in enumerate(frames)}
-        held = set(fixed_poses)
+        free_focal = free_focal and not self.focal_prior.held
+        held = {keyframes.instant(k) for k in fixed_poses}
         poses = np.stack([keyframes.pose(k) for k in frames])
         depths = np.stack([keyframes.depth(k) for k in frames])
         measured = graph.read(edges, number, keyframes, self.device)
@@ -184,7 +230,7 @@ class Adjuster:
             grid=keyframes.grid,
             edges=measured,
             free=Free(
-                poses=torch.tensor([k not in held for k in frames], device=self.device),
+                poses=torch.tensor([keyframes.instant(k) not in held for k in frames], device=self.device),
                 inverse_depth=torch.full((len(frames),), free_depth, dtype=torch.bool, device=self.device),
                 focal=free_focal,
                 distortion=free_focal and not self.focal_prior.same_lens,
@@ -192,13 +238,19 @@ class Adjuster:
             priors=Priors(
                 inverse_depth=prior,
                 inverse_depth_weight=prior_weight,
-                log_focal=self.focal_prior.log_focal if free_focal else None,
+                log_focal=self._log_focal(keyframes) if free_focal else None,
                 # Formal sigmas of dense measurements are too small because their errors are correlated. Dividing the
                 # prior's by the same factor weighs the two against each other as they really are.
                 log_focal_sigma=self.focal_prior.sigma / self.settings.focal_sigma_inflation,
             ),
+            rig=None if keyframes.cam_from_rig is None else rig_of(frames, keyframes.num_views, self.device),
         )
-        return problem, self.state(poses, depths, keyframes.intrinsics)
+        return problem, self.state(poses, depths, keyframes.intrinsics, keyframes.cam_from_rig)
+
+    def _log_focal(self, keyframes: KeyframeMap) -> float | tuple[float, ...]:
+        if keyframes.intrinsics.ndim == 1 or not self.focal_prior.of_views:
+            return self.focal_prior.log_focal
+        return self.focal_prior.of_views
 
     def anneal(self, problem: Problem, state: State, schedule: Sequence[Step]) -> Result | None:
         """Solve with each kernel of the schedule in turn; None when the very first solve fails."""
@@ -225,12 +277,13 @@ class Adjuster:
             result = solved
         return result
 
-    def state(self, poses: Array, depths: Array, intrinsics: Array) -> State:
-        """Poses (N, 4, 4), inverse depths (N, P) and intrinsics on the device."""
+    def state(self, poses: Array, depths: Array, intrinsics: Array, cam_from_rig: Array | None = None) -> State:
+        """Poses (N, 4, 4), inverse depths (N, P), intrinsics and extrinsics on the device."""
         return State(
             cam_from_world=torch.from_numpy(np.ascontiguousarray(poses)).to(self.device),
             inverse_depth=torch.from_numpy(np.ascontiguousarray(depths)).to(self.device),
             intrinsics=torch.from_numpy(np.array(intrinsics, dtype=np.float64)).to(self.device),
+            cam_from_rig=None if cam_from_rig is None else torch.from_numpy(cam_from_rig.copy()).to(self.device),
         )
 
     def _depth_prior(
@@ -269,6 +322,13 @@ def _thinned(problem: Problem, state: State) -> tuple[Problem, State]:
     coarse = Grid(kept.shape[0], kept.shape[1], 2 * grid.stride, grid.offset)
     thin = replace(problem, grid=coarse, edges=edges, priors=priors)
     return thin, replace(state, inverse_depth=state.inverse_depth[:, cells])
+
+
+def rig_of(frames: Sequence[int], num_views: int, device: torch.device) -> Rig:
+    """The rig behind keyframes of a map, in the order of a problem."""
+    instants = np.unique(np.array(frames) // num_views, return_inverse=True)[1]
+    views = np.array(frames) % num_views
+    return Rig(torch.from_numpy(instants).to(device), torch.from_numpy(views).to(device))
 
 
 def _nothing() -> None:

@@ -14,6 +14,7 @@ from vipe_core.ba.problem import Result
 from vipe_core.slam.adjustment import REFINE, SETTLE, Adjuster, Step
 from vipe_core.slam.centring import refine_principal_point
 from vipe_core.slam.closing import LoopCloser
+from vipe_core.slam.crossviews import CrossViews
 from vipe_core.slam.lens import focal_sigma_ratio, plausible
 from vipe_core.slam.masks import MotionMasks
 from vipe_core.slam.measuring import MeasuredGraph
@@ -59,6 +60,7 @@ class Backend:
         self._settings = settings
         self._width = working_width
         self._closer = LoopCloser(measured, adjuster, reprojector)
+        self._cross = CrossViews(measured, reprojector)
         self.focal_sigma_ratio = adjuster.focal_prior.sigma
 
     def run(self) -> Result | None:
@@ -68,6 +70,7 @@ class Backend:
         self._connect_loops()
         if self._closer.run():
             self._connect_loops()
+        self._cross.connect(range(len(self._keyframes)))
         everything = range(len(self._keyframes))
         self._masks.update(everything)
         result = self._adjust()
@@ -97,8 +100,8 @@ class Backend:
 
     def _wide_edges(self) -> list[tuple[int, int]]:
         """Both directions between each keyframe and those a few steps on, as far as they see the same."""
-        count = len(self._keyframes)
-        pairs = [(i, i + step) for step in self._settings.wide_steps for i in range(count - step)]
+        count, views = len(self._keyframes), self._keyframes.num_views
+        pairs = [(i, i + step * views) for step in self._settings.wide_steps for i in range(count - step * views)]
         if not pairs:
             return []
         first, last = [i for i, _ in pairs], [j for _, j in pairs]
@@ -108,7 +111,13 @@ class Backend:
         return [edge for (i, j), keep in zip(pairs, seen, strict=True) if keep for edge in ((i, j), (j, i))]
 
     def recentre(self) -> None:
-        """Find the principal point of the adjusted map, and adjust again where it moved."""
+        """Find the principal point of the adjusted map, and adjust again where it moved; not where it is known.
+
+        Nor that of a rig, whose cameras are calibrated together or have several.
+        """
+        known = self._adjuster.focal_prior.same_lens or self._adjuster.focal_prior.held
+        if known or self._keyframes.cam_from_rig is not None:
+            return
         everything = range(len(self._keyframes))
         rounds = 0
         while rounds < _MAX_CENTRINGS and refine_principal_point(self._keyframes, self._measured.graph, self._adjuster):
@@ -130,24 +139,29 @@ class Backend:
             self._settings.proximity_px * scale,
             self._settings.proximity_overlap,
         )
-        existing = sum(1 for i, j in self._measured.graph if i - j > self._settings.neighbours + 1)
-        for pair in loop_edges(pairs, self._measured.graph, limit - existing):
+        instant = self._keyframes.instant
+        near = self._settings.neighbours + 1
+        existing = sum(1 for i, j in self._measured.graph if instant(i) - instant(j) > near)
+        for pair in loop_edges(pairs, self._measured.graph, limit - existing, num_views=self._keyframes.num_views):
             self._measured.connect(pair.target, pair.source, guided=True, min_consistent=self._settings.min_consistent)
 
     def _adjust(self, schedule: Sequence[Step] = REFINE) -> Result | None:
         """Adjust with a free focal length under its prior; take it back when it runs out of any lens's range."""
+        if self._adjuster.focal_prior.held:
+            return self._adjust_everything(schedule, free_focal=False)
         before = self._keyframes.snapshot()
         result = self._adjust_everything(schedule, free_focal=True)
         if result is None:
             return None
         # A pinhole leaves out the distortion of a real lens, which more measurements do not average away.
-        camera = self._keyframes.camera
-        formal = focal_sigma_ratio(camera, result.intrinsics_covariance)
+        cameras = [self._keyframes.camera_of(view) for view in range(len(result.intrinsics_covariances))]
+        formal = max(map(focal_sigma_ratio, cameras, result.intrinsics_covariances))
         sigma = math.hypot(self._settings.focal_sigma_inflation * formal, self._settings.lens_sigma)
-        if math.isfinite(sigma) and plausible(camera):
+        if math.isfinite(sigma) and all(plausible(camera) for camera in cameras):
             self.focal_sigma_ratio = sigma
             return result
-        logger.info("focal length held: it went to a field of view of %.1f deg, sigma %.3f", camera.fov_x_deg, sigma)
+        fov_deg = cameras[0].fov_x_deg
+        logger.info("focal length held: it went to a field of view of %.1f deg, sigma %.3f", fov_deg, sigma)
         self.focal_sigma_ratio = self._adjuster.focal_prior.sigma
         self._keyframes.restore(before)
         return self._adjust_everything(schedule, free_focal=False)
@@ -155,5 +169,11 @@ class Backend:
     def _adjust_everything(self, schedule: Sequence[Step], *, free_focal: bool) -> Result | None:
         frames = range(len(self._keyframes))
         return self._adjuster.adjust(
-            self._keyframes, self._measured.graph, frames, (0,), schedule, free_focal=free_focal
+            self._keyframes,
+            self._measured.graph,
+            frames,
+            (0,),
+            schedule,
+            free_focal=free_focal,
+            free_extrinsics=self._adjuster.extrinsic_prior is not None,
         )

@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from vipe_core.cameras.ideal import ideal_camera, ideal_px
 from vipe_core.slam.adjustment import FROM_SCRATCH, REFINE, TRACK, Adjuster, FocalPrior, Step
 from vipe_core.slam.consensus import MIN_WEIGHT, consensus_pose
+from vipe_core.slam.keyframes import Snapshot
 from vipe_core.slam.masks import MotionMasks
 from vipe_core.slam.measuring import MeasuredGraph
 from vipe_core.slam.reprojection import Reprojector, splat_inverse_depth
@@ -76,7 +77,7 @@ class _Start:
     """A finished start: the share of the measurements that it explains, and the map."""
 
     explained: float
-    snapshot: tuple[Array, Array, Array]
+    snapshot: Snapshot
 
 
 class Bootstrap:
@@ -127,7 +128,7 @@ class Bootstrap:
         everything = range(len(keyframes))
         prior = self._adjuster.focal_prior
         blank = keyframes.snapshot()
-        best: tuple[float, float, tuple[Array, Array, Array], NDArray[np.bool_]] | None = None
+        best: tuple[float, float, Snapshot, NDArray[np.bool_]] | None = None
         for log_focal in (prior.log_focal, *prior.rivals):
             keyframes.restore(blank)
             for k in everything:

@@ -84,7 +84,7 @@ class LoopCloser:
         for old, new in self._candidates():
             if tried == _MAX_CLOSURES:
                 break
-            if self._hops(old, _NEAR_HOPS)[new] <= _NEAR_HOPS:
+            if self._hops(self._keyframes.instant(old), _NEAR_HOPS)[self._keyframes.instant(new)] <= _NEAR_HOPS:
                 continue
             if self._measured.connect_by_points(old, new, _MIN_CONSISTENT) < _MIN_CONSISTENT:
                 continue
@@ -105,9 +105,10 @@ class LoopCloser:
         count = len(self._keyframes)
         alike = similarity(count, self._measured.overview)
         found = []
+        instant = [self._keyframes.instant(k) for k in range(count)]
         for new in range(count):
-            hops = self._hops(new, _NEAR_HOPS)
-            far = [old for old in range(new) if hops[old] > _NEAR_HOPS]
+            hops = self._hops(instant[new], _NEAR_HOPS)
+            far = [old for old in range(new) if hops[instant[old]] > _NEAR_HOPS]
             if far:
                 old = max(far, key=lambda k: (float(alike[new, k]), -k))
                 found.append((-float(alike[new, old]), old, new))
@@ -115,18 +116,21 @@ class LoopCloser:
         return [(old, new) for _, old, new in sorted(found)[:limit]]
 
     def _hops(self, start: int, limit: int) -> NDArray[np.int64]:
-        """(K,) number of edges between `start` and each keyframe, `limit` + 1 where it is more than `limit`."""
-        hops = np.full(len(self._keyframes), limit + 1, dtype=np.int64)
+        """(K / V,) number of edges between two instants, `limit` + 1 where it is more than `limit`."""
+        views = self._keyframes.num_views
+        hops = np.full(len(self._keyframes) // views, limit + 1, dtype=np.int64)
         hops[start] = 0
         queue = deque([start])
         while queue:
-            k = queue.popleft()
-            if hops[k] == limit:
+            instant = queue.popleft()
+            if hops[instant] == limit:
                 continue
-            for j in self._graph.targets(k):
-                if hops[j] > hops[k] + 1 and self._holds(k, j):
-                    hops[j] = hops[k] + 1
-                    queue.append(j)
+            for k in range(instant * views, (instant + 1) * views):
+                for j in self._graph.targets(k):
+                    there = j // views
+                    if hops[there] > hops[instant] + 1 and self._holds(k, j):
+                        hops[there] = hops[instant] + 1
+                        queue.append(there)
         return hops
 
     def _holds(self, i: int, j: int) -> bool:
@@ -194,7 +198,12 @@ class LoopCloser:
             return None
         match = self._graph[loop.old, loop.new]
         pose, inlier = there
-        induced = self._reprojector.induced(self._keyframes.intrinsics, pose, self._keyframes.depth(loop.old))
+        induced = self._reprojector.induced(
+            self._keyframes.intrinsics_at(loop.old),
+            pose,
+            self._keyframes.depth(loop.old),
+            into=self._keyframes.intrinsics_at(loop.new),
+        )
         cells = np.flatnonzero(inlier & (induced.inverse_depth > 0))
         grid = self._keyframes.grid
         at = np.rint((match.target_px[cells] - grid.offset) / grid.stride).astype(np.int64)
@@ -207,7 +216,21 @@ class LoopCloser:
             logger.debug("loop %d-%d: depths differ by a factor of %.2f", loop.old, loop.new, np.exp(spread))
             return None
         scale = float(np.exp(log_scale))
-        return SimLink(loop.old, loop.new, Sim3(scale, pose[:3, :3], scale * pose[:3, 3]), _LOOP_WEIGHT)
+        between = Sim3(scale, pose[:3, :3], scale * pose[:3, 3])
+        return SimLink(
+            self._keyframes.instant(loop.old),
+            self._keyframes.instant(loop.new),
+            self._mount(loop.new).inverse() @ between @ self._mount(loop.old),
+            _LOOP_WEIGHT,
+        )
+
+    def _mount(self, k: int) -> Sim3:
+        """Camera from rig of a keyframe."""
+        keyframes = self._keyframes
+        if keyframes.cam_from_rig is None:
+            return Sim3(1.0, np.eye(3), np.zeros(3))
+        mount = keyframes.cam_from_rig[k % keyframes.num_views]
+        return Sim3(1.0, mount[:3, :3], mount[:3, 3])
 
     def _resect(self, i: int, j: int) -> tuple[NDArray[np.float64], NDArray[np.bool_]] | None:
         """(4, 4) camera j from camera i in the scale of i's depths, and (P,) the cells that agree."""
@@ -215,12 +238,12 @@ class LoopCloser:
         cells = np.flatnonzero((match.weight.max(axis=1) > _MIN_WEIGHT) & self._keyframes.static(i))
         if len(cells) < _MIN_CELLS:
             return None
-        camera = self._keyframes.camera
+        camera = self._keyframes.camera_of(j % self._keyframes.num_views)
         seen, ahead = ideal_px(camera, match.target_px[cells])
         cells, seen = cells[ahead], seen[ahead]
         if len(cells) < _MIN_CELLS:
             return None
-        rays = self._reprojector.rays(self._keyframes.intrinsics)[cells]
+        rays = self._reprojector.rays(self._keyframes.intrinsics_at(i))[cells]
         points = rays / np.maximum(self._keyframes.depth(i)[cells, None].astype(np.float64), 1e-6)
         found, report = poselib.estimate_absolute_pose(seen, points, ideal_camera(camera), dict(_RESECTION), {})
         pose = np.eye(4)
@@ -231,18 +254,22 @@ class LoopCloser:
         inlier[cells[np.asarray(report["inliers"], dtype=np.bool_)]] = True
         return pose, inlier
 
+    def _poses(self) -> NDArray[np.float64]:
+        """(K / V, 4, 4) of the instants."""
+        keyframes = self._keyframes
+        return np.stack([keyframes.rig_pose(instant) for instant in range(len(keyframes) // keyframes.num_views)])
+
     def _nodes(self) -> list[Sim3]:
-        poses = self._keyframes.poses()
-        return [Sim3(1.0, pose[:3, :3], pose[:3, 3]) for pose in poses]
+        return [Sim3(1.0, pose[:3, :3], pose[:3, 3]) for pose in self._poses()]
 
     def _links(self, edges: Sequence[tuple[int, int]]) -> list[SimLink]:
-        """What the map says between linked keyframes, as sure as the measurements that bear it out."""
-        poses = self._keyframes.poses()
+        """What the map says between linked instants, as sure as the measurements that bear it out."""
+        poses, instant = self._poses(), self._keyframes.instant
         share = dict(zip(edges, self._explained(edges, self._adjuster.robust_scale_px), strict=True))
         weight = {(k, k + 1): _BROKEN_LINK for k in range(len(poses) - 1)}
         for (i, j), explained in share.items():
-            if self._holds(i, j):
-                pair = (min(i, j), max(i, j))
+            if self._holds(i, j) and instant(i) != instant(j):
+                pair = (min(instant(i), instant(j)), max(instant(i), instant(j)))
                 mass = float(self._graph[i, j].weight.mean()) * explained
                 weight[pair] = weight.get(pair, 0.0) + mass
         links = []
@@ -252,9 +279,11 @@ class LoopCloser:
         return links
 
     def _apply(self, nodes: Sequence[Sim3]) -> None:
-        """Move the keyframes; a node's scale goes into its depths and position."""
-        for k, node in enumerate(nodes):
+        """Move the instants; a node's scale goes into its depths and position."""
+        keyframes = self._keyframes
+        for instant, node in enumerate(nodes):
             pose = np.eye(4)
             pose[:3, :3], pose[:3, 3] = node.rotation, node.translation / node.scale
-            self._keyframes.set_pose(k, pose)
-            self._keyframes.set_depth(k, node.scale * self._keyframes.depth(k))
+            keyframes.set_rig_pose(instant, pose)
+            for k in range(instant * keyframes.num_views, (instant + 1) * keyframes.num_views):
+                keyframes.set_depth(k, node.scale * keyframes.depth(k))

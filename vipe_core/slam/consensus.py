@@ -72,6 +72,7 @@ def agree(
     matches: Sequence[Match],
     threshold_px: float,
     current: Array | None = None,
+    into: Sequence[Array] | None = None,
 ) -> Agreement:
     """Find for every cell the inverse depth that the measurements of most views agree on.
 
@@ -83,6 +84,7 @@ def agree(
         target_from_source: (E, 4, 4), one per match; at least one.
         threshold_px: Where the cost of a measurement is cut off.
         current: (P,) inverse depth, or None.
+        into: (K,) index parameters of the other views' cameras, where they have others.
     """
     relative = np.ascontiguousarray(target_from_source, dtype=np.float64)
     target_px = np.stack([match.target_px for match in matches]).astype(np.float32, copy=False)
@@ -90,12 +92,16 @@ def agree(
     rays = reprojector.rays(intrinsics)
     no_current = np.full(len(rays), np.nan)
     views, cells = weight.shape[:2]
+    cameras = np.zeros((views, 5))
+    for view in range(views):
+        params = np.asarray(intrinsics if into is None else into[view], dtype=np.float64)
+        cameras[view, : len(params)] = params
     best = np.empty(cells, np.float32)
     measured = np.empty((views, cells), np.bool_)
     error_px = np.empty((views, cells), np.float32)
     _agree(
         np.ascontiguousarray(rays),
-        np.append(np.asarray(intrinsics, dtype=np.float64), 0.0)[:5],
+        cameras,
         reprojector.model == "mei",
         relative,
         target_px,
@@ -113,7 +119,7 @@ def agree(
 @compiled
 def _agree(
     rays: Array,
-    intrinsics: Array,
+    cameras: Array,
     unified: bool,
     relative: Array,
     target_px: Array,
@@ -125,11 +131,10 @@ def _agree(
     measured: Array,
     error_px: Array,
 ) -> None:
-    """`agree` cell by cell, for a pinhole or the unified model with intrinsics (fx, fy, cx, cy, alpha).
+    """`agree` cell by cell, for pinholes or unified cameras (fx, fy, cx, cy, alpha), one per view.
 
     Along an edge of the picture the flow is not measured: that component counts by its share, as in the adjustment.
     """
-    fx, fy, cx, cy, alpha = intrinsics[0], intrinsics[1], intrinsics[2], intrinsics[3], intrinsics[4]
     views = len(relative)
     turned = np.empty((views, 3))
     share = np.empty((views, 2))
@@ -153,6 +158,8 @@ def _agree(
             else:
                 # The point a + b d (a = R ray, b = t) lies on the target's ray r where r x (a + b d) = 0, least
                 # squares in d. It may be negative: behind the camera, or beyond infinity.
+                fx, fy, cx, cy = cameras[proposal, 0], cameras[proposal, 1], cameras[proposal, 2], cameras[proposal, 3]
+                alpha = cameras[proposal, 4]
                 rx = (target_px[proposal, cell, 0] - cx) / fx
                 ry = (target_px[proposal, cell, 1] - cy) / fy
                 rz = 1.0
@@ -175,6 +182,8 @@ def _agree(
                 error[view] = np.inf
                 if not measured[view, cell]:
                     continue
+                fx, fy, cx, cy = cameras[view, 0], cameras[view, 1], cameras[view, 2], cameras[view, 3]
+                alpha = cameras[view, 4]
                 px = turned[view, 0] + relative[view, 0, 3] * depth
                 py = turned[view, 1] + relative[view, 1, 3] * depth
                 pz = turned[view, 2] + relative[view, 2, 3] * depth

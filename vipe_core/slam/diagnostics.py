@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from vipe_core.geometry import umeyama
 from vipe_core.geometry.arrays import inverse
 from vipe_core.slam.graph import Graph
-from vipe_core.slam.keyframes import KeyframeMap
+from vipe_core.slam.keyframes import KeyframeMap, Snapshot
 from vipe_core.slam.reprojection import Reprojector, relative_pose
 
 Array = NDArray[Any]
@@ -73,17 +73,19 @@ class LoopReport:
 def examine(reprojector: Reprojector, keyframes: KeyframeMap, graph: Graph, robust_scale_px: float) -> MapReport:
     """Measure every edge of the graph against the map."""
     count, cells = len(keyframes), keyframes.grid.num_cells
+    steps = count // keyframes.num_views
     information = np.zeros((count, cells), dtype=np.float64)
     covered = np.zeros((count, cells), dtype=np.bool_)
     parallax = np.zeros(count)
-    link = np.zeros(max(count - 1, 0))
+    link = np.zeros(max(steps - 1, 0))
     inside, total = np.zeros(count), np.zeros(count)
     errors: list[list[Array]] = [[] for _ in range(count)]
     for i, j in graph:
         match = graph[i, j]
         relative = relative_pose(keyframes.pose(j), keyframes.pose(i))
         depth = keyframes.depth(i)
-        induced = reprojector.induced(keyframes.intrinsics, relative, depth)
+        seen_from, seen_in = keyframes.intrinsics_at(i), keyframes.intrinsics_at(j)
+        induced = reprojector.induced(seen_from, relative, depth, into=seen_in)
         weight = match.weight.mean(axis=1)
         use = (weight > _MIN_WEIGHT) & np.isfinite(induced.target_px).all(axis=1)
         if not use.any():
@@ -93,15 +95,15 @@ def examine(reprojector: Reprojector, keyframes: KeyframeMap, graph: Graph, robu
         total[i] += float(weight[use].sum())
         inside[i] += float(weight[inlier].sum())
         errors[i].append(error[inlier][::_THIN].astype(np.float32))
-        first, last = min(i, j), max(i, j)
+        first, last = sorted((keyframes.instant(i), keyframes.instant(j)))
         link[first:last] = np.maximum(link[first:last], float(inlier.mean()))
         covered[i] |= inlier
         # Change of the projection with log depth: what this edge knows about the cell's depth.
-        moved = reprojector.induced(keyframes.intrinsics, relative, depth * np.exp(_LOG_STEP))
+        moved = reprojector.induced(seen_from, relative, depth * np.exp(_LOG_STEP), into=seen_in)
         slope = np.linalg.norm(moved.target_px - induced.target_px, axis=1) / _LOG_STEP
         information[i] += np.where(inlier & np.isfinite(slope), weight * slope**2, 0.0)
         if inlier.any():
-            angle = reprojector.parallax_deg(keyframes.intrinsics, relative, depth)
+            angle = reprojector.parallax_deg(seen_from, relative, depth)
             parallax[i] = max(parallax[i], float(np.median(angle[inlier])))
     sigma = 1.0 / np.sqrt(np.maximum(information, 1e-12))
     confidence = 1.0 / (1.0 + np.square(sigma / _SURE_LOG_DEPTH))
@@ -147,18 +149,20 @@ def examine_loops(
     reprojector: Reprojector,
     keyframes: KeyframeMap,
     graph: Graph,
-    before: tuple[Array, Array, Array],
+    before: Snapshot,
     neighbours: int,
 ) -> LoopReport:
-    """Compare the map with what it was `before`, a `KeyframeMap.snapshot` of the same keyframes."""
-    loops = [(i, j) for i, j in graph if abs(i - j) > neighbours]
-    poses, depths, intrinsics = before
+    """Compare the map with what it was `before`, of the same keyframes."""
+    loops = [(i, j) for i, j in graph if abs(keyframes.instant(i) - keyframes.instant(j)) > neighbours]
+    poses, depths, intrinsics, _ = before
+    per_view = np.atleast_2d(intrinsics)
     errors_before: list[Array] = []
     errors_after: list[Array] = []
     for i, j in loops:
         match = graph[i, j]
         use = match.weight.mean(axis=1) > _MIN_WEIGHT
-        old = reprojector.induced(intrinsics, relative_pose(poses[j], poses[i]), depths[i])
+        seen_from, seen_in = (per_view[k % len(per_view)] for k in (i, j))
+        old = reprojector.induced(seen_from, relative_pose(poses[j], poses[i]), depths[i], into=seen_in)
         new = reprojector.edge(keyframes, i, j)
         for induced, errors in ((old, errors_before), (new, errors_after)):
             error = np.linalg.norm(induced.target_px[use] - match.target_px[use], axis=1)

@@ -17,6 +17,12 @@ _BYTES_PER_PX = 1.5
 _MASK_BYTES_PER_PX = 2.0
 
 
+def bytes_per_px(matcher: DenseMatcher, work: WorkingFrame) -> float:
+    """What keeping the features of a frame takes."""
+    features = matcher.bytes_per_px if isinstance(matcher, BatchEncoder) else _BYTES_PER_PX
+    return features + (0 if work.valid is None else _MASK_BYTES_PER_PX)
+
+
 class EncodedFrames:
     """Features of every frame, in order, as often as they are asked for.
 
@@ -34,7 +40,6 @@ class EncodedFrames:
         self._size = size
         self.matcher = matcher
         self.total_hint = source.info.num_frames_hint
-        self._bytes_per_px = matcher.bytes_per_px if isinstance(matcher, BatchEncoder) else _BYTES_PER_PX
         self._free_px_bytes = cache_bytes / (size.width * size.height)
         self._kept: list[Any] = []
         self.times_s: list[float] = []
@@ -58,7 +63,7 @@ class EncodedFrames:
             for time_s, work, features in self._encoded(frames):
                 if self.cached:
                     self._kept.append(features)
-                self._free_px_bytes -= self._bytes_per_px + (0 if work.valid is None else _MASK_BYTES_PER_PX)
+                self._free_px_bytes -= bytes_per_px(self.matcher, work)
                 if self._free_px_bytes < 0:
                     self._kept = []
                 self.times_s.append(time_s)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import bisect
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from typing import Any
@@ -29,8 +29,8 @@ from vipe_core.slam.selection import Report
 
 Array = NDArray[Any]
 
-_SCHEDULE = (Step("geman_mcclure", 3.0, 6), Step("geman_mcclure", 1.0, 4, 1e-4))
-_MIN_INLIERS = 0.1
+SCHEDULE = (Step("geman_mcclure", 3.0, 6), Step("geman_mcclure", 1.0, 4, 1e-4))
+MIN_INLIERS = 0.1
 _MIN_WEIGHT = 0.02
 
 
@@ -75,7 +75,7 @@ class _Pending:
 
 
 @dataclass(frozen=True, slots=True)
-class _Fit:
+class Fit:
     """How well a pose explains the measurements of its frame; see `Trajectory`."""
 
     residual_px: float
@@ -108,14 +108,7 @@ def fill_in(
         InputError, DecodeError: From the source.
     """
     count = len(frames)
-    trajectory = Trajectory(
-        np.tile(np.eye(4), (count, 1, 1)),
-        np.full(count, np.nan, dtype=np.float32),
-        np.zeros(count, dtype=np.float32),
-        np.zeros(count, dtype=np.float32),
-        np.ones(count, dtype=np.bool_),
-        np.full((count, reprojector.grid.num_cells), UNKNOWN, dtype=np.int8),
-    )
+    trajectory = blank_trajectory(count, reprojector.grid.num_cells)
     times_s = np.array(frames.times_s)
     shots = [
         _ShotInfill(one, frames.matcher, reprojector, times_s, placed, trajectory, batch, aligner, tracks_only, refined)
@@ -211,7 +204,7 @@ class _ShotInfill:
         elif self._poser is not None:
             pending, solved = self._refined(pending, self._poser)
         else:
-            solved = self._adjusted(pending, _SCHEDULE)
+            solved = self._adjusted(pending, SCHEDULE)
             if solved is not None and self._aligner is not None:
                 pending = [
                     self._sharpened(frame, pose, self._aligner) for frame, pose in zip(pending, solved, strict=True)
@@ -221,8 +214,8 @@ class _ShotInfill:
             return
         into = self._into
         for frame, pose in zip(pending, solved, strict=True):
-            fit = self._judged(frame, pose)
-            if fit.inlier_ratio >= _MIN_INLIERS and np.isfinite(pose).all():
+            fit = judge(self._judged(frame, pose), self._adjuster.robust_scale_px)
+            if fit.inlier_ratio >= MIN_INLIERS and np.isfinite(pose).all():
                 into.cam_from_world[frame.index] = pose
                 into.residual_px[frame.index] = fit.residual_px
                 into.inlier_ratio[frame.index] = fit.inlier_ratio
@@ -349,20 +342,40 @@ class _ShotInfill:
         result = self._adjuster.anneal(problem, state, schedule)
         return None if result is None else result.state.cam_from_world[first:].cpu().numpy()
 
-    def _judged(self, frame: _Pending, cam_from_world: Array) -> _Fit:
-        """What the pose makes of the frame's measurements."""
-        inside = total = coverage = 0.0
-        errors = []
+    def _judged(self, frame: _Pending, cam_from_world: Array) -> Iterator[tuple[Induced, Match, Array]]:
         for k, match in frame.matches:
-            induced = self._induced(k, cam_from_world)
-            weight = match.weight.mean(axis=1) * self._usable[k]
-            weight = np.where(weight > _MIN_WEIGHT, weight, 0)
-            error = np.linalg.norm(induced.target_px - match.target_px, axis=1)
-            fits = (weight > 0) & (error < self._adjuster.robust_scale_px)
-            inside += float(weight[fits].sum())
-            total += float(weight.sum())
-            coverage = max(coverage, float(fits.mean()))
-            errors.append(error[fits])
-        all_errors = np.concatenate(errors)
-        residual_px = float(np.median(all_errors)) if len(all_errors) else float("nan")
-        return _Fit(residual_px, inside / total if total > 0 else 0.0, coverage)
+            yield self._induced(k, cam_from_world), match, self._usable[k]
+
+
+def blank_trajectory(count: int, num_cells: int) -> Trajectory:
+    """Of `count` frames of which nothing is known."""
+    return Trajectory(
+        np.tile(np.eye(4), (count, 1, 1)),
+        np.full(count, np.nan, dtype=np.float32),
+        np.zeros(count, dtype=np.float32),
+        np.zeros(count, dtype=np.float32),
+        np.ones(count, dtype=np.bool_),
+        np.full((count, num_cells), UNKNOWN, dtype=np.int8),
+    )
+
+
+def judge(seen: Iterable[tuple[Induced, Match, Array]], robust_scale_px: float) -> Fit:
+    """What a pose makes of measurements.
+
+    Args:
+        seen: Where it sees the cells of a keyframe, their measurement, and (P,) bool, which of them count.
+    """
+    inside = total = coverage = 0.0
+    errors = []
+    for induced, match, usable in seen:
+        weight = match.weight.mean(axis=1) * usable
+        weight = np.where(weight > _MIN_WEIGHT, weight, 0)
+        error = np.linalg.norm(induced.target_px - match.target_px, axis=1)
+        fits = (weight > 0) & (error < robust_scale_px)
+        inside += float(weight[fits].sum())
+        total += float(weight.sum())
+        coverage = max(coverage, float(fits.mean()))
+        errors.append(error[fits])
+    all_errors = np.concatenate(errors)
+    residual_px = float(np.median(all_errors)) if len(all_errors) else float("nan")
+    return Fit(residual_px, inside / total if total > 0 else 0.0, coverage)

@@ -2,20 +2,33 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from vipe_core.ba.problem import Grid
 from vipe_core.cameras import Camera, CameraModel
+from vipe_core.geometry.arrays import inverse
 from vipe_core.slam.selection import Keyframe
 
 Array = NDArray[Any]
 
 
+class Snapshot(NamedTuple):
+    """What adjustments change of a map: (K, 4, 4), (K, P), intrinsics, extrinsics of a rig."""
+
+    poses: NDArray[np.float64]
+    depths: NDArray[np.float32]
+    intrinsics: NDArray[np.float64]
+    cam_from_rig: NDArray[np.float64] | None
+
+
 class KeyframeMap:
     """Poses, inverse depths and features of keyframes 0..K-1, and the intrinsics they share.
+
+    A rig of V views has V keyframes for every instant that was chosen, in order: keyframe k is view k % V of instant
+    k // V. Their poses agree with the extrinsics.
 
     Attributes:
         frame_index: (K,) frame of the video behind each keyframe.
@@ -25,11 +38,17 @@ class KeyframeMap:
         inverse_depth: (K, P) float32, positive.
         static: (K, P) bool, False on cells that appear to move by themselves.
         camera_model: Of all of them.
-        intrinsics: (K,) float64 `Camera.index_params` at the working size.
+        intrinsics: (K,) float64 `Camera.index_params` at the working size; (V, K) where each view of a rig has its own.
+        cam_from_rig: (V, 4, 4) float64 extrinsics of a rig in the units of the map, else None.
+        rig_units: Length of the map's unit in that of the extrinsics as they were given.
     """
 
-    def __init__(self, grid: Grid, camera_model: CameraModel, intrinsics: Array) -> None:
+    def __init__(
+        self, grid: Grid, camera_model: CameraModel, intrinsics: Array, cam_from_rig: Array | None = None
+    ) -> None:
         self.grid = grid
+        self.cam_from_rig: NDArray[np.float64] | None = None if cam_from_rig is None else np.array(cam_from_rig)
+        self.rig_units = 1.0
         self.camera_model: CameraModel = camera_model
         self.intrinsics: NDArray[np.float64] = np.array(intrinsics, dtype=np.float64)
         self.frame_index: list[int] = []
@@ -43,10 +62,44 @@ class KeyframeMap:
         return len(self.frame_index)
 
     @property
+    def num_views(self) -> int:
+        return 1 if self.cam_from_rig is None else len(self.cam_from_rig)
+
+    def instant(self, k: int) -> int:
+        """The number of the moment of a keyframe, without a rig its own."""
+        return k // self.num_views
+
+    def intrinsics_of(self, view: int) -> NDArray[np.float64]:
+        """(K,) those of a view."""
+        intrinsics: NDArray[np.float64] = self.intrinsics if self.intrinsics.ndim == 1 else self.intrinsics[view]
+        return intrinsics
+
+    def intrinsics_at(self, k: int) -> NDArray[np.float64]:
+        """(K,) those of a keyframe."""
+        return self.intrinsics_of(k % self.num_views)
+
+    @property
     def camera(self) -> Camera:
-        """The camera as it is known now, at the working size."""
+        """The camera as it is known now, at the working size; of a rig, that of view 0."""
+        return self.camera_of(0)
+
+    def camera_of(self, view: int) -> Camera:
         width, height = (round(cells * self.grid.stride) for cells in (self.grid.width, self.grid.height))
-        return Camera.from_index_params(self.camera_model, self.intrinsics, width, height)
+        return Camera.from_index_params(self.camera_model, self.intrinsics_of(view), width, height)
+
+    def rig_pose(self, instant: int) -> NDArray[np.float64]:
+        """(4, 4) rig_from_world at an instant; without a rig the keyframe's own pose."""
+        if self.cam_from_rig is None:
+            return self.pose(instant)
+        return np.asarray(inverse(self.cam_from_rig[0]) @ self.pose(instant * self.num_views))
+
+    def set_rig_pose(self, instant: int, rig_from_world: Array) -> None:
+        """Place all views of an instant."""
+        if self.cam_from_rig is None:
+            self.set_pose(instant, rig_from_world)
+            return
+        for view, mount in enumerate(self.cam_from_rig):
+            self.set_pose(instant * self.num_views + view, mount @ rig_from_world)
 
     def append(self, keyframe: Keyframe, time_s: float, cam_from_world: Array, inverse_depth: Array) -> int:
         """Add a keyframe and return its number."""
@@ -101,16 +154,17 @@ class KeyframeMap:
         """(K, P) copy of all motion masks."""
         return np.stack(self._static)
 
-    def snapshot(self) -> tuple[Array, Array, Array]:
-        """Poses, inverse depths and intrinsics, to `restore` later."""
-        return self.poses(), self.depths(), self.intrinsics.copy()
+    def snapshot(self) -> Snapshot:
+        """What adjustments change, to `restore` later."""
+        extrinsics = None if self.cam_from_rig is None else self.cam_from_rig.copy()
+        return Snapshot(self.poses(), self.depths(), self.intrinsics.copy(), extrinsics)
 
-    def restore(self, snapshot: tuple[Array, Array, Array]) -> None:
-        poses, depths, intrinsics = snapshot
-        for k in range(len(poses)):
-            self.set_pose(k, poses[k])
-            self.set_depth(k, depths[k])
-        self.intrinsics = np.array(intrinsics, dtype=np.float64)
+    def restore(self, snapshot: Snapshot) -> None:
+        for k in range(len(snapshot.poses)):
+            self.set_pose(k, snapshot.poses[k])
+            self.set_depth(k, snapshot.depths[k])
+        self.intrinsics = np.array(snapshot.intrinsics, dtype=np.float64)
+        self.cam_from_rig = None if snapshot.cam_from_rig is None else snapshot.cam_from_rig.copy()
 
     def normalise_scale(self) -> None:
         """Rescale the world so that the median inverse depth is 1. Leaves every reprojection as it is."""
@@ -120,3 +174,6 @@ class KeyframeMap:
         for k in range(len(self)):
             self._depths[k] = (self._depths[k] / median).astype(np.float32)
             self._poses[k][:3, 3] *= median
+        if self.cam_from_rig is not None:
+            self.cam_from_rig[:, :3, 3] *= median
+            self.rig_units /= median

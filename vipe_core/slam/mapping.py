@@ -252,7 +252,7 @@ class ShotMapper:
         inflation = self._settings.focal_sigma_inflation
         start = fitter.chain(len(keyframes), links, keyframes.intrinsics)
         scaled = FocalPrior(prior.log_focal, prior.sigma / inflation)
-        fit = fitter.fit(start, (0,), links, keyframes.intrinsics, scaled)
+        fit = fitter.fit(start, (0,), links, keyframes.intrinsics, None if prior.held else scaled)
         logger.debug("rotation only: %.3f px, with positions: %.3f px", fit.residual_px, found.residual_px)
         if not fit.residual_px <= _ROTATION_RATIO * found.residual_px + _ROTATION_SLACK_PX:
             return None
@@ -263,6 +263,8 @@ class ShotMapper:
             keyframes.set_pose(k, pose)
             keyframes.set_depth(k, np.ones(keyframes.grid.num_cells))
             keyframes.set_static(k, np.ones(keyframes.grid.num_cells, dtype=np.bool_))
+        if prior.held:
+            return prior.sigma
         return math.hypot(inflation * fit.log_focal_sigma, self._settings.lens_sigma)
 
 

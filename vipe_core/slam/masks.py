@@ -127,6 +127,10 @@ class MotionMasks:
             return static
         return np.asarray(static & (2 * found.support(self.robust_scale_px) > found.votes))
 
+    def targets(self, k: int) -> list[int]:
+        """Where keyframe `k` has edges to."""
+        return self._graph.targets(k)
+
     def agreement(self, k: int, targets: Iterable[int]) -> Agreement | None:
         """What the edges from keyframe `k` to placed keyframes `targets` agree on; None without an edge."""
         keyframes = self._keyframes
@@ -136,5 +140,11 @@ class MotionMasks:
         relative = relative_pose(np.stack([keyframes.pose(j) for j in measured]), keyframes.pose(k))
         matches = [self._graph[k, j] for j in measured]
         return agree(
-            self._reprojector, keyframes.intrinsics, relative, matches, self.robust_scale_px, keyframes.depth(k)
+            self._reprojector,
+            keyframes.intrinsics_at(k),
+            relative,
+            matches,
+            self.robust_scale_px,
+            keyframes.depth(k),
+            [keyframes.intrinsics_at(j) for j in measured],
         )

@@ -50,6 +50,19 @@ class MeasuredGraph:
         self._dense_flow = dense_flow
         self._aligner = aligner if dense_flow else None
 
+    def of(self, keyframes: KeyframeMap, graph: Graph) -> MeasuredGraph:
+        """The same way of measuring for another map."""
+        return MeasuredGraph(
+            keyframes,
+            graph,
+            self._matcher,
+            self._sparse,
+            self._points,
+            self._reprojector,
+            dense_flow=self._dense_flow,
+            aligner=self._aligner,
+        )
+
     def overview(self, k: int) -> NDArray[np.float32]:
         """(n, D) descriptors by which the place of a keyframe is recognised; none without a matcher of points."""
         if self._points is None:

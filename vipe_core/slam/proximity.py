@@ -86,15 +86,18 @@ def screened(
     return [targets[row] for row in np.sort(nearest)]
 
 
-def loop_edges(pairs: Sequence[Pair], graph: Graph, limit: int, radius: int = 2) -> list[Pair]:
-    """The nearest `limit` pairs, none within `radius` steps of an edge of the graph or of another choice."""
+def loop_edges(pairs: Sequence[Pair], graph: Graph, limit: int, radius: int = 2, num_views: int = 1) -> list[Pair]:
+    """The nearest `limit` pairs, none within `radius` steps of an edge of the graph or of another choice.
+
+    Steps are instants of a rig of `num_views`; pairs of other views are no neighbours.
+    """
     taken = set(graph)
     chosen: list[Pair] = []
     for pair in pairs:
         if len(chosen) == limit:
             break
         near = any(
-            (pair.source + di, pair.target + dj) in taken
+            (pair.source + num_views * di, pair.target + num_views * dj) in taken
             for di in range(-radius, radius + 1)
             for dj in range(-radius + abs(di), radius - abs(di) + 1)
         )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -64,7 +64,12 @@ class Reprojector:
         return np.asarray(unproject(self.model, params, at).numpy())
 
     def induced(
-        self, intrinsics: Array, target_from_source: Array, inverse_depth: Array, cells: Array | None = None
+        self,
+        intrinsics: Array,
+        target_from_source: Array,
+        inverse_depth: Array,
+        cells: Array | None = None,
+        into: Array | None = None,
     ) -> Induced:
         """Cells with inverse depths seen through relative poses.
 
@@ -73,6 +78,7 @@ class Reprojector:
             target_from_source: (..., 4, 4).
             inverse_depth: (..., P) of the source cells.
             cells: Numbers of the cells that `inverse_depth` belongs to; all of the grid if None.
+            into: (K,) index parameters of the target camera, where that is another one.
         """
         params = torch.from_numpy(np.asarray(intrinsics, dtype=np.float64))
         relative = torch.from_numpy(np.asarray(target_from_source, dtype=np.float64))
@@ -80,7 +86,8 @@ class Reprojector:
         px = self._px if cells is None else self._px[torch.from_numpy(np.asarray(cells, dtype=np.int64))]
         rays = unproject(self.model, params, px)
         points = rays @ relative[..., :3, :3].mT + relative[..., None, :3, 3] * depth[..., None]
-        target_px, valid = project(self.model, params, points)
+        target_params = params if into is None else torch.from_numpy(np.asarray(into, dtype=np.float64))
+        target_px, valid = project(self.model, target_params, points)
         # The homogeneous scale starts at |ray|; what is left of it is the ratio of the depths.
         length = points[..., 2] if self.model == "pinhole" else points.norm(dim=-1)
         valid = valid & (length > MIN_DEPTH_RATIO)
@@ -109,9 +116,9 @@ class Reprojector:
 
     def edge(self, keyframes: KeyframeMap, i: int, j: int) -> Induced:
         """The cells of keyframe `i` in keyframe `j`."""
-        return self.induced(
-            keyframes.intrinsics, relative_pose(keyframes.pose(j), keyframes.pose(i)), keyframes.depth(i)
-        )
+        relative = relative_pose(keyframes.pose(j), keyframes.pose(i))
+        into = keyframes.intrinsics_at(j)
+        return self.induced(keyframes.intrinsics_at(i), relative, keyframes.depth(i), into=into)
 
     def fan(self, keyframes: KeyframeMap, sources: Sequence[int], targets: Sequence[int], subsample: int) -> Fan:
         """Displacement and overlap of many pairs, on every `subsample`-th row and column of the grid."""
@@ -122,11 +129,27 @@ class Reprojector:
             np.stack([keyframes.pose(j) for j in targets]), np.stack([keyframes.pose(i) for i in sources])
         )
         depth = np.stack([keyframes.depth(i)[cells] for i in sources])
-        induced = self.induced(keyframes.intrinsics, relative, depth, cells)
-        count = induced.visible.sum(axis=-1)
-        total = np.where(induced.visible, induced.displacement_px, 0).sum(axis=-1, dtype=np.float64)
+        count, total = np.empty(len(depth)), np.empty(len(depth))
+        for rows_of, seen_from, seen_in in _by_cameras(keyframes, sources, targets):
+            induced = self.induced(seen_from, relative[rows_of], depth[rows_of], cells, seen_in)
+            count[rows_of] = induced.visible.sum(axis=-1)
+            total[rows_of] = np.where(induced.visible, induced.displacement_px, 0).sum(axis=-1, dtype=np.float64)
         motion = np.where(count > 0, total / np.maximum(count, 1), np.inf)
         return Fan(motion, count / len(cells))
+
+
+def _by_cameras(
+    keyframes: KeyframeMap, sources: Sequence[int], targets: Sequence[int]
+) -> Iterator[tuple[Array, Array, Array]]:
+    """Rows of pairs whose sources have one camera and whose targets have one, with the intrinsics of both."""
+    if keyframes.intrinsics.ndim == 1:
+        yield np.arange(len(sources)), keyframes.intrinsics, keyframes.intrinsics
+        return
+    views = keyframes.num_views
+    pair = np.array(sources) % views * views + np.array(targets) % views
+    for both in np.unique(pair).tolist():
+        rows = np.flatnonzero(pair == both)
+        yield rows, keyframes.intrinsics_of(both // views), keyframes.intrinsics_of(both % views)
 
 
 def relative_pose(target_from_world: Array, source_from_world: Array) -> NDArray[np.float64]:

@@ -11,7 +11,7 @@ import math
 from collections.abc import Callable
 from contextlib import closing
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,7 +27,7 @@ logger = logging.getLogger(__name__)
 Report = Callable[[str, int, int | None], None]
 """(stage, frames done, frames in total if known)"""
 
-_MAX_LOWERINGS = 3
+MAX_LOWERINGS = 3
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,7 +75,7 @@ class Selection:
         return len(self.timestamps_s)
 
 
-class _Thinned:
+class Thinned:
     """At most `capacity` frames at even spacing of a stream of unknown length: the spacing doubles when it is full."""
 
     def __init__(self, capacity: int) -> None:
@@ -94,7 +94,14 @@ class _Thinned:
         self.frames.append(frame)
 
 
-class _MotionFilter:
+class Motion(Protocol):
+    """How far the picture moved; part of `DenseMatcher`."""
+
+    def motion_px(self, source: Any, target: Any) -> float:
+        """Median displacement, pixels."""
+
+
+class MotionFilter:
     """Makes a frame a keyframe when the picture has moved by `threshold_px` since the last one.
 
     Attributes:
@@ -102,7 +109,7 @@ class _MotionFilter:
         path_px: All that the displacement went up and down.
     """
 
-    def __init__(self, matcher: DenseMatcher, threshold_px: float) -> None:
+    def __init__(self, matcher: Motion, threshold_px: float) -> None:
         self.matcher = matcher
         self.threshold_px = threshold_px
         self.num_frames = 0
@@ -134,7 +141,7 @@ class _MotionFilter:
         if self._previous is not None and self._previous_motion_px > 0.25 * self.threshold_px:
             self._take(self._previous)
 
-    def lowered(self, min_keyframes: int, static_px: float) -> _MotionFilter | None:
+    def lowered(self, min_keyframes: int, static_px: float) -> MotionFilter | None:
         """A filter with a lower threshold for the same shot; None when this one has found enough or nothing moves.
 
         The path counts all motion, towards the last keyframe too: what returns would look slow by its net motion, and
@@ -145,7 +152,7 @@ class _MotionFilter:
         largest_px = min(self.threshold_px, self.max_motion_px)
         lower_px = max(0.5 * static_px, min(0.6 * largest_px, self.path_px / (min_keyframes + 2)))
         logger.debug("%d keyframes are few: threshold lowered to %.2f px", len(self.keyframes), lower_px)
-        return _MotionFilter(self.matcher, lower_px)
+        return MotionFilter(self.matcher, lower_px)
 
     def _take(self, keyframe: Keyframe) -> None:
         self.keyframes.append(keyframe)
@@ -162,7 +169,7 @@ class _Pass:
     def __init__(self, matcher: DenseMatcher, threshold_px: float) -> None:
         self._matcher = matcher
         self._threshold_px = threshold_px
-        self.filters: list[_MotionFilter] = []
+        self.filters: list[MotionFilter] = []
         self.cuts: list[int] = []
         self.shot_of: dict[int, int] = {}
 
@@ -172,7 +179,7 @@ class _Pass:
             if one.cut:
                 self.cuts.append(picture.index)
             if one.cut or not self.filters:
-                self.filters.append(_MotionFilter(self._matcher, self._threshold_px))
+                self.filters.append(MotionFilter(self._matcher, self._threshold_px))
             self.shot_of[picture.index] = len(self.filters) - 1
             self.filters[-1].add(Keyframe(picture.index, picture.features))
 
@@ -191,7 +198,7 @@ def select_keyframes(frames: EncodedFrames, size: WorkingSize, settings: SlamSet
         InputError, DecodeError: From the source.
     """
     matcher = frames.matcher
-    thinned = _Thinned(settings.sample_frames)
+    thinned = Thinned(settings.sample_frames)
     static_px = settings.scaled_px(settings.static_motion_px, size.width)
     splitter = ShotSplitter(matcher)
     found = _Pass(matcher, settings.scaled_px(settings.keyframe_motion_px, size.width))
@@ -208,7 +215,7 @@ def select_keyframes(frames: EncodedFrames, size: WorkingSize, settings: SlamSet
     found.place(splitter.finish())
     for motion in found.filters:
         motion.finish()
-    for _ in range(_MAX_LOWERINGS):
+    for _ in range(MAX_LOWERINGS):
         lowered = [motion.lowered(settings.min_keyframes, static_px) for motion in found.filters]
         if not any(lowered):
             break

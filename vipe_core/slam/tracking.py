@@ -16,7 +16,9 @@ from vipe_core.slam.reprojection import Reprojector, splat_inverse_depth
 from vipe_core.slam.selection import Keyframe
 from vipe_core.slam.settings import SlamSettings
 
-_MAX_VELOCITY_RATIO = 1.5
+MAX_VELOCITY_RATIO = 1.5
+"""A prediction goes on for at most this many times the last step."""
+
 # Robust cost as a share of the largest possible below which a pose needs no second start.
 _GOOD_FIT = 0.1
 
@@ -68,7 +70,7 @@ class Tracker:
         if last == 0:
             return self._keyframes.pose(0)
         before_s, now_s = self._keyframes.times_s[last - 1 : last + 1]
-        reach_s = min(time_s, now_s + _MAX_VELOCITY_RATIO * (now_s - before_s))
+        reach_s = min(time_s, now_s + MAX_VELOCITY_RATIO * (now_s - before_s))
         poses = np.stack([self._keyframes.pose(last - 1), self._keyframes.pose(last)])
         predicted: NDArray[np.float64] = interpolate_trajectory([before_s, now_s], poses, [reach_s], extrapolate=True)[
             0
