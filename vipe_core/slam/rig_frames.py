@@ -7,7 +7,7 @@ from contextlib import closing
 from typing import Any, Protocol
 
 from vipe_core.errors import EmptyMedia
-from vipe_core.priors.protocols import DenseMatcher, WorkingFrame
+from vipe_core.priors.protocols import BatchEncoder, DenseMatcher, WorkingFrame
 from vipe_core.slam.frames import bytes_per_px
 from vipe_core.slam.working import WorkingSize, working_frame
 from vipe_core.video.source import Frame, VideoInfo
@@ -71,10 +71,10 @@ class EncodedRig:
         with closing(self._source.frames(self._size.size)) as instants:
             for instant in instants:
                 works = [working_frame(frame) for frame in instant]
-                features = tuple(self.matcher.encode(work) for work in works)
+                features = self._encode(works)
                 if self.cached:
                     self._kept.append(features)
-                self._free_px_bytes -= sum(bytes_per_px(work) for work in works)
+                self._free_px_bytes -= sum(bytes_per_px(self.matcher, work) for work in works)
                 if self._free_px_bytes < 0:
                     self._kept = []
                 self.times_s.append(instant[0].timestamp_s)
@@ -94,7 +94,13 @@ class EncodedRig:
             return
         with closing(self._source.frames(self._size.size, start=start, stop=stop)) as instants:
             for instant in instants:
-                yield instant[0].index, tuple(self.matcher.encode(working_frame(frame)) for frame in instant)
+                yield instant[0].index, self._encode([working_frame(frame) for frame in instant])
+
+    def _encode(self, works: Sequence[WorkingFrame]) -> tuple[Any, ...]:
+        """Features of the views, together where the matcher encodes several at once."""
+        if isinstance(self.matcher, BatchEncoder):
+            return tuple(self.matcher.encode_batch(works))
+        return tuple(self.matcher.encode(work) for work in works)
 
     def release(self) -> None:
         """Forget the pictures; nothing asks for them any more."""
