@@ -89,10 +89,10 @@ def judge(store: SqlStore, job_id: str, faults: list[Injected], verified: tuple[
         if name.startswith("poison"):
             deaths = result.deaths if result else None
             right = row.status is VideoStatus.QUARANTINED and deaths is not None and len(deaths) >= 2
-        elif name == "cut":
-            right = row.status is VideoStatus.FAILED and code_found == "media_corrupt"
         elif name in guilty:
             right = row.status is VideoStatus.FAILED and code_found == "engine_failed"
+        elif name == "cut":
+            right = row.status is VideoStatus.FAILED and code_found == "media_corrupt"
         else:
             right = row.status is VideoStatus.SUCCEEDED
         if not right:

@@ -1,4 +1,4 @@
-"""Expand inputs into videos: directories, files, S3 objects and prefixes, web addresses, and lists of any of these.
+"""Expand inputs into videos: directories, files, tars, S3 objects and prefixes, web addresses, and lists of these.
 
 One video at a time, in a fixed order, in bounded memory.
 """
@@ -8,9 +8,10 @@ from __future__ import annotations
 import os
 import stat
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import BinaryIO
 from urllib.parse import urlsplit
@@ -24,8 +25,10 @@ from services.domain.errors import (
 )
 from services.inputs.download import download, look
 from services.inputs.rules import WEB_SCHEMES, InputRules
+from services.inputs.tars import HEADER_BUFFER_BYTES, as_member, is_tar, list_members
 from services.network.http import GuardedHttp
 from services.planner.manifest import Row, is_manifest, read_manifest
+from services.storage.object_file import open_object
 from services.storage.open import open_store
 from services.storage.roots import lies_within
 
@@ -57,7 +60,8 @@ def expand(uri: str, rules: InputRules | None = None, *, s3_endpoint_url: str | 
 
     A directory is walked recursively in name order; names that start with a dot are left out, and so are links that
     leave the directory and links to directories. A directory without videos but with images is one video. A file is
-    one video whatever its name, unless it is a list (`.csv`, `.jsonl`, `.parquet`; see `planner.manifest`).
+    one video whatever its name, unless it is a list (`.csv`, `.jsonl`, `.parquet`; see `planner.manifest`) or a tar
+    (`.tar`, also below a directory or a prefix): of that, every member whose name is a video's (see `inputs.tars`).
 
     Args:
         uri: An absolute path, `s3://bucket/key`, `s3://bucket/prefix/`, or `http(s)://host/path`.
@@ -81,7 +85,9 @@ def expand(uri: str, rules: InputRules | None = None, *, s3_endpoint_url: str | 
 
 
 def _expand(uri: str, rules: InputRules, s3_endpoint_url: str | None) -> Iterator[Found]:
-    if is_manifest(urlsplit(uri).path if uri.startswith(WEB_SCHEMES) else uri) and not Path(uri).is_dir():
+    if as_member(uri) is not None:
+        yield Found(uri, 0)
+    elif is_manifest(urlsplit(uri).path if uri.startswith(WEB_SCHEMES) else uri) and not Path(uri).is_dir():
         yield from _expand_manifest(uri, rules, s3_endpoint_url)
     elif uri.startswith("s3://"):
         yield from _expand_s3(uri, s3_endpoint_url)
@@ -110,6 +116,8 @@ def _listed(row: Row, name: str, rules: InputRules) -> Found:
         rules.check(row.uri)
     except ServiceError as error:
         raise InvalidManifest(f"{name}, row {row.number}: {error}") from error
+    if as_member(row.uri) is not None:
+        return Found(row.uri, row.size_bytes, row.etag, row.key)
     if row.uri.startswith(WEB_SCHEMES):
         return Found(row.uri.partition("#")[0], row.size_bytes, row.etag, row.key)
     if row.uri.startswith("s3://"):
@@ -162,17 +170,64 @@ def _expand_s3(uri: str, endpoint_url: str | None) -> Iterator[Found]:
             info = open_store(f"s3://{bucket}", endpoint_url=endpoint_url).head(key)
             if info is None:
                 raise InputUnavailable(f"there is no object {uri}; a prefix must end in '/'")
-            yield Found(uri, info.size_bytes, info.etag)
+            named = Found(uri, info.size_bytes, info.etag)
+            yield from _named(named, partial(_open_s3, named, endpoint_url))
             return
         empty = True
         for info in open_store(f"s3://{bucket}/{key}".rstrip("/"), endpoint_url=endpoint_url).list():
-            if _is_video(info.key.rsplit("/", 1)[-1]):
+            below = Found(f"s3://{bucket}/{key}{info.key}", info.size_bytes, info.etag)
+            for video in _met(below, partial(_open_s3, below, endpoint_url)):
                 empty = False
-                yield Found(f"s3://{bucket}/{key}{info.key}", info.size_bytes, info.etag)
+                yield video
     except ObjectMissing as error:
         raise InputUnavailable(f"cannot read {uri}: {error}") from error
     if empty:
         raise InputUnavailable(f"no videos found under {uri}")
+
+
+def _open_s3(tar: Found, endpoint_url: str | None) -> BinaryIO:
+    bucket, _, key = tar.uri.removeprefix("s3://").partition("/")
+    store = open_store(f"s3://{bucket}", endpoint_url=endpoint_url)
+    return open_object(store, key, 0, tar.size_bytes, buffer_bytes=HEADER_BUFFER_BYTES)
+
+
+def _open_local(path: Path, rules: InputRules) -> BinaryIO:
+    return os.fdopen(rules.open_local(str(path)), "rb")
+
+
+def _named(file: Found, opened: Callable[[], BinaryIO]) -> Iterator[Found]:
+    """A file that the user named: it is a video unless it is a tar."""
+    if not is_tar(file.uri):
+        yield file
+        return
+    empty = True
+    for video in _members(file, opened):
+        empty = False
+        yield video
+    if empty:
+        raise InputUnavailable(f"no videos found in {file.uri}")
+
+
+def _met(file: Found, opened: Callable[[], BinaryIO]) -> Iterator[Found]:
+    """A file below a directory or a prefix: a video, a tar, or nothing of ours.
+
+    A tar that cannot be read fails later as one video, for the sake of all the others.
+    """
+    name = file.uri.rsplit("/", 1)[-1]
+    if _is_video(name):
+        yield file
+    elif is_tar(name) and not name.startswith("."):
+        try:
+            yield from _members(file, opened)
+        except InputUnavailable:
+            yield file
+
+
+def _members(tar: Found, opened: Callable[[], BinaryIO]) -> Iterator[Found]:
+    with opened() as file:
+        for member, size_bytes in list_members(file, tar.uri):
+            if _is_video(member.name.rsplit("/", 1)[-1]):
+                yield Found(member.uri, size_bytes, tar.etag)
 
 
 def _expand_local(uri: str, rules: InputRules) -> Iterator[Found]:
@@ -186,16 +241,17 @@ def _expand_local(uri: str, rules: InputRules) -> Iterator[Found]:
     if not lies_within(resolved, rules.roots):
         raise InputUnavailable(f"input {uri} lies outside of the directories that this service may read")
     if stat.S_ISREG(status.st_mode):
-        yield Found(str(path), status.st_size)
+        yield from _named(Found(str(path), status.st_size), partial(_open_local, path, rules))
         return
     if not stat.S_ISDIR(status.st_mode):
         raise InputUnavailable(f"input {uri} is neither a file nor a directory")
 
     walk = _Walk(resolved)
     empty = True
-    for video in walk.videos(path):
-        empty = False
-        yield video
+    for file in walk.files(path):
+        for video in _met(file, partial(_open_local, Path(file.uri), rules)):
+            empty = False
+            yield video
     if not empty:
         return
     images = walk.images(path)
@@ -213,11 +269,12 @@ class _Walk:
         self._root = root
         self.links_ignored = 0
 
-    def videos(self, folder: Path) -> Iterator[Found]:
+    def files(self, folder: Path) -> Iterator[Found]:
+        """Those that are videos or may hold some."""
         for entry in self._entries(folder):
             if entry.is_dir(follow_symlinks=False):
-                yield from self.videos(folder / entry.name)
-            elif _is_video(entry.name) and self._stays_inside(entry) and entry.is_file():
+                yield from self.files(folder / entry.name)
+            elif (_is_video(entry.name) or is_tar(entry.name)) and self._stays_inside(entry) and entry.is_file():
                 yield Found(str(folder / entry.name), entry.stat().st_size)
 
     def images(self, folder: Path) -> list[int]:

@@ -78,6 +78,7 @@ def test_loop_edges_keep_their_distance_from_each_other() -> None:
     chosen = loop_edges(pairs, Graph(), limit=10)
     assert [(p.source, p.target) for p in chosen] == [(20, 3), (30, 3)]
     assert len(loop_edges(pairs, Graph(), limit=1)) == 1
+    assert loop_edges(pairs, Graph(), limit=-3) == [], "there are more than enough already"
 
 
 def test_scale_is_normalised_without_moving_a_reprojection() -> None:

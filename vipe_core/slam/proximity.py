@@ -94,7 +94,7 @@ def loop_edges(pairs: Sequence[Pair], graph: Graph, limit: int, radius: int = 2,
     taken = set(graph)
     chosen: list[Pair] = []
     for pair in pairs:
-        if len(chosen) == limit:
+        if len(chosen) >= limit:
             break
         near = any(
             (pair.source + num_views * di, pair.target + num_views * dj) in taken
