@@ -11,7 +11,7 @@ from __future__ import annotations
 import tarfile
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 from services.domain.errors import InputUnavailable
 
@@ -66,7 +66,8 @@ def list_members(file: BinaryIO, tar: str) -> Iterator[tuple[Member, int]]:
         InputUnavailable: Not a tar, cut short, or with a name or a size that no honest tar has.
     """
     try:
-        with tarfile.open(fileobj=file, mode="r:") as reader:
+        with tarfile.open(fileobj=file, mode="r:") as opened:
+            reader: Any = opened
             while (info := reader.next()) is not None:
                 reader.members.clear()  # A list of all that were read: the tar may hold millions.
                 if info.type not in (tarfile.REGTYPE, tarfile.AREGTYPE) or info.sparse is not None:
