@@ -17,13 +17,14 @@ from vipe_core.depth.aligned import AlignedDepth
 from vipe_core.depth.known import KnownLength
 from vipe_core.depth.scene import scene_of
 from vipe_core.depth.stream import DenseDepth
+from vipe_core.depth.without import NoDepth
 from vipe_core.errors import EngineError, VipeError
 from vipe_core.pipeline.device import describe_device, resolve_device, set_threads
 from vipe_core.pipeline.presets import Preset, resolve
 from vipe_core.pipeline.provenance import engine_version, library_versions
-from vipe_core.pipeline.providers import open_depth
+from vipe_core.pipeline.providers import open_depth, open_priors
 from vipe_core.pipeline.scaling import ScaledScene, set_scale
-from vipe_core.priors.classical import classical_priors
+from vipe_core.priors.weights import require
 from vipe_core.quality import assess
 from vipe_core.slam.system import Slam
 from vipe_core.video import MaskedView, open_source
@@ -38,12 +39,14 @@ class Annotator:
     Args:
         preset: Name of a preset, or a `Preset` of one's own.
         camera: Camera model to estimate, `pinhole`, `mei` (wide angle) or `auto`; the preset's own if None.
-        device: `cpu`, `cuda` or `cuda:N`: where bundle adjustment runs.
+        device: `cpu`, `cuda` or `cuda:N`: where bundle adjustment and networks run.
         threads: CPU threads of torch and OpenCV in this process. The result depends on it in the last digits; one is
             the choice that gives the same bytes everywhere, and the most videos per hour of a machine.
 
     Raises:
         ConfigError: Preset, camera or device is not on offer.
+        WeightsMissing, WeightsInvalid: The weights that the preset needs are not on this machine, or are damaged; both
+            are ConfigErrors, and the message names the command that fetches them.
     """
 
     def __init__(
@@ -58,6 +61,8 @@ class Annotator:
         self.device = resolve_device(device)
         self.threads = threads
         set_threads(threads)
+        self._weights = {name: require(name).sha256 for name in self.preset.weights}
+        self._priors = open_priors(self.preset.matcher, self.preset.camera, self.device)
         self._depth = open_depth(self.preset.depth, self.device)
 
     def annotate(
@@ -94,9 +99,7 @@ class Annotator:
             source = MaskedView(source, masks)
         report = _Reporter(progress)
 
-        # New matchers for each video: OpenCV's flow object keeps buffers of the last picture size and is not safe to
-        # use with another one, and nothing of one video may reach the next.
-        slam = Slam(classical_priors(self.preset.camera), self.preset.slam, self.device)
+        slam = Slam(self._priors(), self.preset.slam, self.device)
         with _typed_errors(source, report), torch.inference_mode():
             result = slam.run(source, report)
             quality = assess(result, self.preset.slam, source.info.width)
@@ -135,7 +138,7 @@ class Annotator:
             device=describe_device(self.device, self.threads),
             libraries=library_versions(),
             providers=self.preset.providers,
-            weights={},
+            weights=self._weights,
             source={
                 "name": info.name,
                 "width": info.width,
@@ -174,8 +177,10 @@ class Annotator:
                 yield DenseFrame(frame.index, frame.rgb, frame.depth, frame.confidence, mask, frame.kind)
                 report("depth", frame.index + 1, total)
 
-    def _depth_stage(self, scaled: ScaledScene) -> AlignedDepth | DenseDepth:
-        """Video depth aligned to the map where the preset has it, multi-view stereo elsewhere."""
+    def _depth_stage(self, scaled: ScaledScene) -> AlignedDepth | DenseDepth | NoDepth:
+        """Video depth aligned to the map where the preset has it, multi-view stereo elsewhere, or nothing."""
+        if not self.preset.makes_depth:
+            return NoDepth()
         if self._depth.video is None:
             return DenseDepth(self.preset.dense_depth)
         return AlignedDepth(self._depth, self.preset.alignment, metres=scaled.scale == "metric")

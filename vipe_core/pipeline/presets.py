@@ -10,9 +10,14 @@ from dataclasses import dataclass, field
 from vipe_core.depth.alignment import AlignmentSettings
 from vipe_core.depth.types import DepthSettings
 from vipe_core.errors import ConfigError
-from vipe_core.slam.settings import SlamSettings
+from vipe_core.slam.settings import EnergyTerms, SlamSettings
 
 CAMERAS = ("pinhole", "mei", "auto")
+NO_DEPTH = "none"
+"""What `Preset.depth` says where no dense depth is made."""
+
+_NO_TRACKS = "none"
+_PROVIDER_WEIGHTS: dict[str, tuple[str, ...]] = {"droid.network": ("droid",)}
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,6 +65,16 @@ class Preset:
             "dense_depth": self.depth,
         }
 
+    @property
+    def weights(self) -> tuple[str, ...]:
+        """Names of the weights that its providers need, of `vipe_core.priors.weights`."""
+        return tuple(name for provider in self.providers.values() for name in _PROVIDER_WEIGHTS.get(provider, ()))
+
+    @property
+    def makes_depth(self) -> bool:
+        """Whether its dense stream has any depth."""
+        return self.depth != NO_DEPTH
+
 
 _CLASSICAL = Preset(
     name="classical",
@@ -69,12 +84,22 @@ _CLASSICAL = Preset(
     intrinsics="classical.two_view_focal",
     depth="classical.plane_sweep",
 )
+# The network was trained on pictures of this size, and its edges know what moves: no tracks, no masks beside it.
+_NETWORK = dataclasses.replace(
+    _CLASSICAL,
+    matcher="droid.network",
+    sparse=_NO_TRACKS,
+    slam=SlamSettings(working_area_px=512 * 384, terms=EnergyTerms(sparse_tracks=False)),
+    dense_depth=DepthSettings.fast(),
+)
 _PRESETS = {
     preset.name: preset
     for preset in (
         _CLASSICAL,
         dataclasses.replace(_CLASSICAL, name="classical_fast", dense_depth=DepthSettings.fast()),
         dataclasses.replace(_CLASSICAL, name="wide_angle", camera="mei"),
+        dataclasses.replace(_NETWORK, name="vipe_fast"),
+        dataclasses.replace(_NETWORK, name="pose_only", depth=NO_DEPTH),
     )
 }
 _INTRINSICS = {
@@ -85,7 +110,8 @@ _INTRINSICS = {
 
 PRESETS = tuple(_PRESETS)
 """Names, the default first. `classical_fast` has the same poses and map, and coarser dense depth for less time;
-`wide_angle` estimates the bend of the lens as well."""
+`wide_angle` estimates the bend of the lens as well. `vipe_fast` and `pose_only` find poses as the paper does, by the
+DROID network and bundle adjustment in turns, and need its weights; the one has coarse dense depth, the other none."""
 
 
 def resolve(preset: str | Preset, camera: str | None = None) -> Preset:
