@@ -9,7 +9,7 @@ from typing import Annotated, ParamSpec, TypeVar
 
 import typer
 
-from services.cli import annotate, data, demo, evaluate, export, gallery, jobs, keys, serve, tenants
+from services.cli import annotate, data, demo, evaluate, export, gallery, jobs, keys, models, serve, tenants
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -97,6 +97,17 @@ _KEY_COMMANDS: dict[str, Callable[..., None]] = {
 for _name, _command in _KEY_COMMANDS.items():
     _keys.command(_name)(_typed_errors(_command))
 app.add_typer(_keys, name="keys")
+
+_models = typer.Typer(help="Network weights: list, pull, verify, mirror.", no_args_is_help=True, rich_markup_mode=None)
+_MODEL_COMMANDS: dict[str, Callable[..., None]] = {
+    "list": models.list_models,
+    "pull": models.pull,
+    "verify": models.verify,
+    "mirror": models.mirror,
+}
+for _name, _command in _MODEL_COMMANDS.items():
+    _models.command(_name)(_typed_errors(_command))
+app.add_typer(_models, name="models")
 
 if __name__ == "__main__":
     sys.exit(app())

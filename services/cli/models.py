@@ -1,0 +1,82 @@
+"""`vipectl models list | pull | verify | mirror`: the network weights that presets need."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+
+Names = Annotated[list[str] | None, typer.Argument(help="Of weights; all of them if none is given.")]
+
+
+def list_models() -> None:
+    """List weights: licence, size, which presets need them, and whether they are on this machine."""
+    from rich.table import Table
+
+    from services.cli.tables import results_console
+    from vipe_core.pipeline.presets import PRESETS, resolve
+    from vipe_core.priors.weights import WEIGHTS, path_of, record_of, weights_folder
+
+    table = Table(show_edge=False, pad_edge=False, header_style="bold")
+    for title in ("name", "presets", "licence", "MB", "here", "SHA-256", "project"):
+        table.add_column(title, overflow="fold")
+    for name, weights in WEIGHTS.items():
+        presets = ", ".join(preset for preset in PRESETS if name in resolve(preset).weights)
+        record = record_of(name)
+        sha256 = weights.sha256 or (f"{record.sha256} (of the first pull)" if record else "not published")
+        here = "yes" if path_of(name).is_file() else "no"
+        table.add_row(name, presets, weights.licence, f"{weights.size_bytes / 1e6:.0f}", here, sha256, weights.project)
+    results_console().print(table)
+    typer.echo(f"in {weights_folder()}")
+
+
+def pull(
+    names: Names = None,
+    origin: Annotated[
+        str | None,
+        typer.Option(
+            "--from", help="Instead of the public address: an http(s) address of the file, a directory or s3:// mirror."
+        ),
+    ] = None,
+    sha256: Annotated[str | None, typer.Option(help="What the checksum must be, where none is published.")] = None,
+    force: Annotated[bool, typer.Option(help="Fetch it although it is here.")] = False,
+) -> None:
+    """Fetch weights to this machine; go on with a download that broke off.
+
+    Where no checksum is published, that of the first pull is written down and every later one must agree.
+    """
+    from services.weights import pull as pull_weights
+    from vipe_core.priors.weights import WEIGHTS, known
+
+    chosen = names or list(WEIGHTS)
+    if (sha256 or (origin or "").startswith("http")) and len(chosen) != 1:
+        raise typer.BadParameter("an address or a checksum belongs to one name", param_hint="NAMES")
+    for name in chosen:
+        weights = known(name)
+        typer.echo(f"{name}: {weights.project}, licence {weights.licence}")
+        pulled = pull_weights(name, origin=origin, sha256=sha256, force=force)
+        what = "fetched" if pulled.fetched else "is here already"
+        trust = ", trusted on first use: nobody has published a checksum" if pulled.first_use else ""
+        typer.echo(f"{name}: {what}, {pulled.record.size_bytes} bytes, SHA-256 {pulled.record.sha256}{trust}")
+
+
+def verify(names: Names = None) -> None:
+    """Compare checksums of the weights on this machine with the published ones, or those of the first pull."""
+    from vipe_core.priors.weights import WEIGHTS, expected_sha256, path_of, require
+
+    for name in names or [name for name in WEIGHTS if path_of(name).is_file()]:
+        installed = require(name)
+        known_by = "as it should be" if expected_sha256(name) else "nothing to compare it with: it was not pulled"
+        typer.echo(f"{name}: {installed.sha256}, {known_by}")
+
+
+def mirror(
+    uri: Annotated[str, typer.Argument(help="A directory or s3://bucket/prefix.")],
+    names: Annotated[list[str] | None, typer.Argument(help="Of weights; all that are here if none is given.")] = None,
+) -> None:
+    """Copy the weights on this machine to object storage, for `vipectl models pull --from`."""
+    from services.weights import mirror as mirror_weights
+    from vipe_core.priors.weights import WEIGHTS, path_of
+
+    for address in mirror_weights(names or [name for name in WEIGHTS if path_of(name).is_file()], uri):
+        typer.echo(address)

@@ -1,0 +1,197 @@
+"""Weights from a real web server and from a mirror: resumed, verified, and never in place with a wrong checksum."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterator
+from dataclasses import replace
+from http.server import BaseHTTPRequestHandler
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+from web_server import Web, page, serve
+
+from services.cli.main import app
+from services.domain.errors import HttpFailed, ObjectMissing
+from services.weights import mirror, pull
+from vipe_core.errors import WeightsInvalid, WeightsMissing
+from vipe_core.priors import weights as registry
+from vipe_core.priors.weights import checksum, path_of, record_of, require
+
+CONTENT = bytes(range(256)) * 2000
+SHA256 = hashlib.sha256(CONTENT).hexdigest()
+
+
+class File:
+    """A file on the server that can break off and be replaced.
+
+    Attributes:
+        breaks_at: Byte at which the next answer ends, once.
+        ranges: What `Range` said, request by request.
+    """
+
+    def __init__(self, content: bytes, etag: str = '"one"', *, ranges_known: bool = True) -> None:
+        self.content, self.etag, self.ranges_known = content, etag, ranges_known
+        self.breaks_at: int | None = None
+        self.ranges: list[str | None] = []
+
+    def __call__(self, request: BaseHTTPRequestHandler) -> None:
+        asked = request.headers.get("Range")
+        self.ranges.append(asked)
+        begin = 0
+        if asked and self.ranges_known and request.headers.get("If-Range") == self.etag:
+            begin = int(asked.removeprefix("bytes=").rstrip("-"))
+        request.send_response(206 if begin else 200)
+        if begin:
+            last = len(self.content) - 1
+            request.send_header("Content-Range", f"bytes {begin}-{last}/{len(self.content)}")
+        request.send_header("ETag", self.etag)
+        request.send_header("Content-Length", str(len(self.content) - begin))
+        request.end_headers()
+        end, self.breaks_at = self.breaks_at, None
+        request.wfile.write(self.content[begin:end])
+        if end is not None:
+            request.close_connection = True
+
+
+@pytest.fixture
+def web() -> Iterator[Web]:
+    with serve() as running:
+        yield running
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv("VIPE_WEIGHTS", str(tmp_path / "weights"))
+    return tmp_path / "weights"
+
+
+def publish(monkeypatch: pytest.MonkeyPatch, web: Web, sha256: str | None) -> None:
+    """Let the registry name the test's server."""
+    one = replace(registry.WEIGHTS["droid"], urls=(web.url("/gone"), web.url("/droid.pth")), sha256=sha256)
+    monkeypatch.setitem(registry.WEIGHTS, "droid", one)
+
+
+def test_a_pull_takes_the_first_address_that_answers_and_verifies(
+    web: Web, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    publish(monkeypatch, web, SHA256)
+    web.pages["/droid.pth"] = File(CONTENT)
+    told: list[tuple[int, int | None]] = []
+    pulled = pull("droid", progress=lambda here, total: told.append((here, total)))
+    assert (pulled.fetched, pulled.first_use) == (True, False)
+    assert pulled.path.read_bytes() == CONTENT
+    assert told[-1] == (len(CONTENT), len(CONTENT))
+    assert require("droid").sha256 == SHA256
+    assert sorted(path.name for path in folder.iterdir()) == ["droid.pth", "droid.pth.json"]
+    asked = len(web.asked)
+    assert not pull("droid").fetched
+    assert len(web.asked) == asked
+
+
+@pytest.mark.parametrize("ranges_known", [True, False])
+def test_a_download_that_breaks_off_goes_on_with_the_next_pull(web: Web, folder: Path, ranges_known: bool) -> None:
+    file = File(CONTENT, ranges_known=ranges_known)
+    file.breaks_at = 300_000
+    web.pages["/droid.pth"] = file
+    with pytest.raises(HttpFailed, match="pull again"):
+        pull("droid", origin=web.url("/droid.pth"))
+    assert not path_of("droid").exists()
+    pulled = pull("droid", origin=web.url("/droid.pth"))
+    assert pulled.path.read_bytes() == CONTENT
+    assert file.ranges[0] is None
+    assert file.ranges[1] is not None
+    assert 0 < int(file.ranges[1].removeprefix("bytes=").rstrip("-")) <= 300_000
+
+
+def test_a_file_that_was_replaced_meanwhile_is_fetched_from_its_start(web: Web, folder: Path) -> None:
+    file = File(bytes(len(CONTENT)))
+    file.breaks_at = 300_000
+    web.pages["/droid.pth"] = file
+    with pytest.raises(HttpFailed):
+        pull("droid", origin=web.url("/droid.pth"))
+    web.pages["/droid.pth"] = File(CONTENT, '"two"')
+    assert pull("droid", origin=web.url("/droid.pth")).record.sha256 == SHA256
+
+
+def test_a_wrong_checksum_leaves_nothing_in_place(web: Web, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    publish(monkeypatch, web, "0" * 64)
+    web.pages["/droid.pth"] = File(CONTENT)
+    with pytest.raises(WeightsInvalid, match=SHA256):
+        pull("droid")
+    assert list(folder.iterdir()) == []
+    with pytest.raises(WeightsMissing):
+        require("droid")
+
+
+def test_without_a_published_checksum_the_first_one_counts(web: Web, folder: Path) -> None:
+    web.pages["/droid.pth"] = File(CONTENT)
+    assert pull("droid", origin=web.url("/droid.pth")).first_use
+    record = record_of("droid")
+    assert record is not None
+    assert record.sha256 == SHA256
+    web.pages["/droid.pth"] = File(CONTENT + b"more", '"two"')
+    with pytest.raises(WeightsInvalid):
+        pull("droid", origin=web.url("/droid.pth"), force=True)
+    assert checksum(path_of("droid")) == SHA256
+    with pytest.raises(WeightsInvalid):
+        pull("droid", sha256="1" * 64)
+
+
+def test_a_web_page_in_the_place_of_a_file_and_a_refusal_are_told_apart_from_weights(web: Web, folder: Path) -> None:
+    web.pages["/droid.pth"] = page(b"<html>Sign in</html>", Content_Type="text/html; charset=utf-8")
+    with pytest.raises(HttpFailed, match="web page"):
+        pull("droid", origin=web.url("/droid.pth"))
+    with pytest.raises(HttpFailed, match="status 404"):
+        pull("droid", origin=web.url("/nothing"))
+    with pytest.raises(WeightsMissing, match="known: droid"):
+        pull("android")
+
+
+def test_a_mirror_serves_a_machine_without_internet(
+    web: Web, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    web.pages["/droid.pth"] = File(CONTENT)
+    pull("droid", origin=web.url("/droid.pth"))
+    store = tmp_path / "mirror"
+    assert mirror(["droid"], str(store)) == [f"{store}/droid.pth"]
+    monkeypatch.setenv("VIPE_WEIGHTS", str(tmp_path / "elsewhere"))
+    pulled = pull("droid", origin=str(store))
+    assert pulled.path.read_bytes() == CONTENT
+    assert not pulled.first_use
+    (store / "droid.pth").write_bytes(CONTENT[:-1])
+    with pytest.raises(WeightsInvalid, match="deleted"):
+        pull("droid", origin=str(store), force=True)
+    assert require("droid").sha256 == SHA256
+    with pytest.raises(ObjectMissing):
+        pull("droid", origin=str(tmp_path / "empty"), force=True)
+
+
+def test_the_command_lists_pulls_verifies_and_mirrors(web: Web, folder: Path, tmp_path: Path) -> None:
+    web.pages["/droid.pth"] = File(CONTENT)
+
+    def vipectl(*words: str) -> tuple[int, str]:
+        done = CliRunner().invoke(app, ["models", *words])
+        return done.exit_code, done.output
+
+    code, text = vipectl("list")
+    assert code == 0
+    assert all(word in text for word in ("droid", "pose_only", "BSD-3-Clause", "not published"))
+    code, text = vipectl("verify", "droid")
+    assert code == 1
+    assert "weights_missing" in text
+    code, text = vipectl("pull", "droid", "--from", web.url("/droid.pth"))
+    assert code == 0, text
+    assert "trusted on first use" in text
+    assert "BSD-3-Clause" in text
+    assert vipectl("mirror", str(tmp_path / "mirror"))[1].strip() == f"{tmp_path}/mirror/droid.pth"
+    assert json.loads((tmp_path / "mirror" / "droid.pth.json").read_text())["sha256"] == SHA256
+    code, text = vipectl("verify")
+    assert code == 0
+    assert SHA256 in text
+    path_of("droid").write_bytes(b"damaged")
+    code, text = vipectl("verify")
+    assert code == 1
+    assert "weights_invalid" in text
