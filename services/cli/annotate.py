@@ -24,7 +24,11 @@ def annotate(
         ),
     ],
     preset: Annotated[
-        str, typer.Option(help="classical; classical_fast: coarser dense depth; wide_angle: a bent lens.")
+        str,
+        typer.Option(
+            help="classical; classical_fast: coarser dense depth; wide_angle: a bent lens; vipe_fast, pose_only: by "
+            "the DROID network (vipectl models)."
+        ),
     ] = "classical",
     camera: Annotated[
         str | None, typer.Option(help="pinhole, mei (wide angle), or auto. Default: the preset's own.")
