@@ -1,8 +1,9 @@
 """Levenberg-Marquardt over the normal equations: the entry points of bundle adjustment.
 
-Convergence is a predicate of the expected and the actual gain, computed where the numbers are. On a GPU the host reads
-it once per step, with everything else that it decides on; on a CPU, where reading is free, a state that is at its
-minimum already costs one linearisation.
+Single precision on a GPU is solved by `cuda/`, which follows the rules of this file on the device. Here is the loop for
+everything else. Convergence is a predicate of the expected and the actual gain, computed where the numbers are. On a
+GPU the host reads it once per step, with everything else that it decides on; on a CPU, where reading is free, a state
+that is at its minimum already costs one linearisation.
 """
 
 from __future__ import annotations
@@ -15,17 +16,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from vipe_core.ba import robust
+from vipe_core.ba import cuda, robust
 from vipe_core.ba.host_solver import HostSolver
 from vipe_core.ba.problem import NO_COVARIANCE, Covariance, Edges, Options, Problem, Result, Rig, State, Status
 from vipe_core.ba.reprojection import require_supported
 from vipe_core.ba.scale import largest_residual_px
-from vipe_core.ba.solver import Cost, Solver, Step
+from vipe_core.ba.solver import MIN_DAMPING, Cost, Solver, Step
 from vipe_core.ba.torch_solver import TorchSolver
 
 _MAX_DAMPING = 1e8
-# Single precision leaves errors of this size in the reduced system: less damping only makes it indefinite.
-_MIN_DAMPING = {torch.float32: 1e-7, torch.float64: 1e-10}
 # A free gauge does not couple with the focal length, so the least damping that makes the system invertible will do.
 _SIGMA_DAMPINGS = (1e-9, 1e-7, 1e-5)
 _ACCEPTED_FACTOR = 0.2
@@ -61,6 +60,9 @@ def solve(problem: Problem, state: State, options: Options | None = None) -> Res
             that is free in some frames only.
     """
     options = options or Options()
+    require_supported(problem.camera_model)
+    if cuda.takes(problem, state) and (result := cuda.solve(problem, state, options)) is not None:
+        return result
     problem, state = _on_device(problem, state)
     if not _finite(problem, state):
         return Result(state, Status.NON_FINITE, 0, math.nan, math.nan, 0.0)
@@ -110,7 +112,7 @@ class _Descent:
         self._options = options
         self._on_host = state.inverse_depth.device.type == "cpu"
         self._damping = options.initial_damping
-        self._min_damping = _MIN_DAMPING[state.inverse_depth.dtype]
+        self._min_damping = MIN_DAMPING[state.inverse_depth.dtype]
         self._scale_px = math.nan
         self.judge_at(options.robust_scale_px)
 

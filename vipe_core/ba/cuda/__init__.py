@@ -1,0 +1,50 @@
+"""Bundle adjustment in CUDA kernels: single precision per cell, double from 6x6 blocks on, every decision on the GPU.
+
+The algebra is that of `torch_solver.py`, the descent that of `levenberg.py`. Per Levenberg-Marquardt step:
+
+    transform     edges of the proposed state, twists of the proposed step          (per edge)
+    tile          finish the step of the depths, then cost and normal equations     (per slice of a unit)
+    fold          slices -> 6x6 blocks of poses, tail and right-hand side           (per unit)
+    assemble      -> blocks of the reduced system                                   (per 7 blocks)
+    judge         accept or reject, damping, convergence                            (one)
+    damp, gather, factorise, substitute                                             (per tile of the factor, by level)
+    propose       step of poses and intrinsics, what it is expected to gain         (one)
+
+A solve launches a fixed sequence; whatever is left when it has converged returns at once. `layout.py` works out the
+graph, `compiler.py` and `launcher.py` turn `kernels/*.cu` into code for the GPU at hand, `solver.py` runs it.
+"""
+
+from __future__ import annotations
+
+import torch
+
+from vipe_core.ba.cuda.launcher import device_launcher
+from vipe_core.ba.cuda.solver import Adjustment, specialisation
+from vipe_core.ba.problem import Options, Problem, Result, State
+
+
+def takes(problem: Problem, state: State) -> bool:
+    """Whether the kernels are for this problem: single precision on a GPU, one camera, and something measured."""
+    depth = state.inverse_depth
+    one_camera = problem.rig is None and state.intrinsics.ndim == 1
+    return depth.device.type == "cuda" and depth.dtype == torch.float32 and one_camera and len(problem.edges.source) > 0
+
+
+def prepare(problem: Problem, state: State, options: Options) -> Adjustment | None:
+    """A problem that the kernels take, ready to run; None where they cannot be compiled or loaded (logged once)."""
+    device = state.inverse_depth.device
+    index = torch.cuda.current_device() if device.index is None else device.index
+    launcher = device_launcher(index, specialisation(problem, options))
+    if launcher is None:
+        return None
+    return Adjustment(problem, state, options, launcher)
+
+
+def solve(problem: Problem, state: State, options: Options) -> Result | None:
+    """See `vipe_core.ba.solve`. One wait for the GPU, at the end; None as `prepare`."""
+    with torch.cuda.device(state.inverse_depth.device):
+        adjustment = prepare(problem, state, options)
+        if adjustment is None:
+            return None
+        adjustment.run()
+        return adjustment.result()

@@ -1,0 +1,119 @@
+"""Sources of the kernels -> code for one GPU, with NVRTC through cuda-core.
+
+Nothing but the driver, NVRTC (which comes with torch's CUDA wheels) and cuda-core is needed: no toolkit, no headers, no
+host compiler. Compiled code is kept on disk under a key of source, options, architecture and compiler version;
+cuda-core writes it atomically.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable
+from dataclasses import dataclass
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+from vipe_core.ba.cuda.context import CONTEXT_BYTES, CONTROL_BYTES
+from vipe_core.ba.problem import RobustKernel
+
+_COMMON = ("context.cu", "pixel.cu")
+_SYSTEM = ("largest.cu", "reduce.cu", "factor.cu", "descent.cu")
+_TILE = ("tile.cu",)
+
+# As `Robust` in `kernels/context.cu`.
+ROBUST_CODE: dict[RobustKernel, int] = {"none": 0, "huber": 1, "cauchy": 2, "geman_mcclure": 3, "tukey": 4}
+SYSTEM_KERNELS = (
+    *("begin", "widen", "transform", "largest", "fold", "assemble", "judge"),
+    *("damp", "gather", "factorise", "substitute", "propose", "covariance", "finish"),
+)
+TILE_KERNELS = ("tile", "tile_large")
+
+
+@dataclass(frozen=True, slots=True)
+class Specialisation:
+    """What the pass over the cells is compiled for."""
+
+    unified: bool
+    focal: bool
+    alpha: bool
+    robust: RobustKernel
+
+    def definition(self, suffix: str = "") -> str:
+        """The two kernels of this specialisation; their names end in `suffix`."""
+        flags = ", ".join(str(flag).lower() for flag in (self.unified, self.focal, self.alpha))
+        # Blocks of threads that a multiprocessor should hold, which bounds registers to 65536 / 128 / blocks.
+        kernels = zip(TILE_KERNELS, ("false", "true"), (3 if self.alpha else 4, 3), strict=True)
+        return "".join(
+            f"DEFINE_TILE_KERNEL({name}{suffix}, {flags}, {ROBUST_CODE[self.robust]}, {large}, {blocks})\n"
+            for name, large, blocks in kernels
+        )
+
+
+def specialisations() -> Iterable[Specialisation]:
+    """All there are: alpha is an intrinsic of the unified camera only."""
+    for robust in ROBUST_CODE:
+        for unified, focal, alpha in ((0, 0, 0), (0, 1, 0), (1, 0, 0), (1, 1, 0), (1, 0, 1), (1, 1, 1)):
+            yield Specialisation(bool(unified), bool(focal), bool(alpha), robust)
+
+
+def _read(names: Iterable[str]) -> str:
+    folder = resources.files("vipe_core.ba.cuda") / "kernels"
+    return "".join((folder / name).read_text() for name in names)
+
+
+def system_source() -> str:
+    """Everything but the pass over the cells."""
+    return _sizes() + _read(_COMMON + _SYSTEM)
+
+
+def tile_source(chosen: Iterable[Specialisation], *, numbered: bool = False) -> str:
+    """The pass over the cells; kernels of several specialisations are numbered to tell them apart."""
+    definitions = (kind.definition(f"_{k}" if numbered else "") for k, kind in enumerate(chosen))
+    return _sizes() + _read(_COMMON + _TILE) + "".join(definitions)
+
+
+def _sizes() -> str:
+    return f"#define CONTEXT_BYTES {CONTEXT_BYTES}\n#define CONTROL_BYTES {CONTROL_BYTES}\n"
+
+
+def cache_folder() -> Path:
+    """Where compiled kernels are kept."""
+    root = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    return Path(root) / "vipe_core" / "kernels"
+
+
+def compile_kernels(source: str, architecture: str, *, cache: Path | None, log: Any = None) -> Any:
+    """Compile for an architecture like `sm_90`; no GPU is needed.
+
+    Args:
+        cache: Folder of compiled code, or None to compile in any case.
+        log: Where the compiler's report on registers and memory goes, if anywhere; anything with `write`.
+
+    Returns:
+        The `cuda.core.ObjectCode` of a cubin.
+
+    Raises:
+        ImportError: cuda-core or cuda-bindings is not installed.
+        Exception: Whatever cuda-core raises where NVRTC is missing or rejects the source.
+    """
+    from cuda.core import Program, ProgramOptions
+    from cuda.core.utils import FileStreamProgramCache
+
+    options = ProgramOptions(
+        name="vipe_ba",
+        std="c++17",
+        arch=architecture,
+        # Two units in the last place instead of a half; sums are single precision anyway.
+        prec_div=False,
+        prec_sqrt=False,
+        ptxas_options=["-v"] if log is not None else None,
+    )
+    program = Program(source, "c++", options)
+    try:
+        if cache is None:
+            return program.compile("cubin", logs=log)
+        with FileStreamProgramCache(cache) as kept:
+            return program.compile("cubin", logs=log, cache=kept)
+    finally:
+        program.close()

@@ -1,0 +1,42 @@
+"""The argument of every kernel: sizes, settings and addresses, mirrored from `kernels/context.cu`."""
+
+from __future__ import annotations
+
+import ctypes
+
+_SIZES = (
+    "num_frames num_edges num_cells width num_units num_slices num_nodes num_blocks num_sides "
+    "unified focal_free alpha_free robust anything_free max_iterations has_prior scratch_stride"
+)
+_SETTINGS = (
+    "stride offset robust_scale first_scale tolerance initial_damping min_damping min_depth_ratio "
+    "min_depth max_depth log_focal log_focal_information"
+)
+_ADDRESSES = (
+    "target_px weight prior_value prior_weight finite median largest "
+    "pose depth intrinsics "
+    "frame_node edge_id edge_source edge_target edge_transform edge_adjoint edge_twist pose_step "
+    "unit_frame unit_first unit_count unit_free unit_partial unit_direct unit_eliminated "
+    "partial scratch pool unit_sums "
+    "block_row block_column direct_first direct_entry eliminated_first eliminated_entry diagonal_block blocks "
+    "tile_row tile_column tile_first product_left product_right tile_block_first tile_block "
+    "column_diagonal column_first column_tile level_column factor diagonal_factor scale solution "
+    "control report"
+)
+
+
+class Context(ctypes.Structure):
+    """Passed by value to every kernel."""
+
+    _fields_ = (
+        *((name, ctypes.c_int64) for name in _SIZES.split()),
+        *((name, ctypes.c_double) for name in _SETTINGS.split()),
+        *((name, ctypes.c_void_p) for name in _ADDRESSES.split()),
+    )
+
+
+CONTROL_BYTES = 256
+REPORT_NUMBERS = 10
+"""Status, steps tried, cost before, cost, weight, covariance missing, covariance (4)."""
+
+CONTEXT_BYTES = ctypes.sizeof(Context)

@@ -1,0 +1,176 @@
+// What every kernel is given, and the state of the descent. Freestanding: no headers, only the compiler's built-ins.
+//
+// All kernels of a solve are launched one after the other on one stream, whatever becomes of it: the decisions of
+// Levenberg-Marquardt are taken in `judge` and `propose`, and a kernel that has nothing to do returns at once.
+// No atomics, and every sum has a fixed order, so a result has the same bits every time.
+
+#ifndef DYNAMIC_SHARED
+#define DYNAMIC_SHARED(NAME)               \
+    extern __shared__ float4 NAME##_raw[]; \
+    float* NAME = (float*)NAME##_raw
+#endif
+
+typedef long long i64;
+
+// Cells that one block handles at a time, and in all: sums are single precision over a slice, double across slices.
+#define TILE 64
+#define SLICE 256
+#define TILE_THREADS 128
+#define TILE_WARPS (TILE_THREADS / 32)
+// Scalars of the reduced system per tile of its factor: eight blocks of six.
+#define SIDE 48
+#define SIDE_BLOCKS 8
+#define FACTOR_THREADS 256
+#define WIDE_THREADS 256
+#define ASSEMBLE_BLOCKS 7
+
+#define MIN_CURVATURE 1e-12
+#define MAX_LOG_FOCAL_STEP 0.3
+#define MAX_ALPHA 1.2
+#define MAX_DAMPING 1e8
+#define ACCEPTED_FACTOR 0.2
+#define REJECTED_FACTOR 10.0
+#define NEGLIGIBLE_COST 1e-14
+#define UNTRIED_SHARE 0.1
+#define TRUSTED_DAMPING 1e-2
+#define NARROWING 1.4
+#define TINY 1.2e-38f
+
+enum Status { RUNNING, CONVERGED, MAX_ITERATIONS, NO_PROGRESS, SINGULAR, NON_FINITE, EMPTY };
+enum Robust { NONE, HUBER, CAUCHY, GEMAN_MCCLURE, TUKEY };
+// What the next pass over the cells is for: nothing, the normal equations at the state, or those of a candidate.
+enum Mode { IDLE, LINEARISE, STEP };
+
+// The descent, in device memory. Costs are those of `state` at the kernel's scale of its linearisation.
+struct Control {
+    i64 done, status, iterations;
+    i64 state, system;   // which of the two buffers holds the accepted state, and its normal equations
+    i64 mode, solve;     // what to do next; whether there is a system to factorise
+    i64 factorised;      // whether every pivot so far was positive
+    i64 first;           // whether nothing has been judged yet
+    i64 level, num_levels;  // of graduated non-convexity
+    i64 covariance_found;
+    double damping;
+    double scale_system, scale_judge, scale_next;  // of the accepted linearisation, of judging and of the next one
+    double lost_rho, measured, weight, lost, prior;
+    double initial_cost, initial_weight;
+    double predicted, first_scale;
+    double covariance[4];
+};
+
+// Mirrored by `context.py`; every member has eight bytes.
+struct Context {
+    i64 num_frames, num_edges, num_cells, width, num_units, num_slices;
+    i64 num_nodes;    // free poses; node `num_nodes` is the tail: free intrinsics, then the right-hand side
+    i64 num_blocks;   // 6x6 blocks of the reduced system
+    i64 num_sides;    // tiles along a side of the factor
+    i64 unified, focal_free, alpha_free, robust, anything_free, max_iterations;
+    i64 has_prior;
+    i64 scratch_stride;  // floats of `scratch` per block
+    double stride, offset, robust_scale, first_scale, tolerance, initial_damping, min_damping, min_depth_ratio;
+    double min_depth, max_depth, log_focal, log_focal_information;
+
+    // The problem. Pixels and weights are (E, P, 2), in the order that they came in.
+    const float* target_px;
+    const float* weight;
+    const float* prior_value;   // (N, P)
+    const float* prior_weight;
+    const unsigned char* finite;  // whether state and priors are
+    const float* median;          // of the inverse depths
+    float* largest;               // (E) argument of the robust kernel, px^2
+
+    // The state, twice: poses (2, N, 16), inverse depths (2, N, P), intrinsics (2, 5).
+    double* pose;
+    float* depth;
+    double* intrinsics;
+
+    // Edges in order of (source, target).
+    const int* frame_node;  // (N) node of a free pose, or -1
+    const int* edge_id;
+    const int* edge_source;
+    const int* edge_target;
+    float* edge_transform;  // (2, E, 12) rows of [R | t], as the state
+    double* edge_adjoint;   // (E, 36) where it was linearised last
+    float* edge_twist;      // (E, 8) of the proposed step, then those of log f and alpha
+    double* pose_step;      // (N, 6)
+
+    // Units: the edges of a frame whose depths are eliminated together, or some of a frame whose depths are held.
+    const int* unit_frame;
+    const int* unit_first;
+    const int* unit_count;
+    const int* unit_free;
+    const i64* unit_partial;    // offset of its slices in `partial`
+    const i64* unit_direct;     // of its first block in `pool`: 3 per edge, then 3
+    const i64* unit_eliminated; // likewise: the lower triangle over (source, targets, tail)
+    float* partial;
+    float* scratch;             // rows and products of units too large for shared memory
+    double* pool;
+    double* unit_sums;          // (units, 5) cost to judge, cost at the next scale, weight, all weight, prior
+
+    // The reduced system in blocks: where each is summed from, (first, entries); an entry is 2 * block + transposed.
+    const int* block_row;
+    const int* block_column;
+    const int* direct_first;
+    const int* direct_entry;
+    const int* eliminated_first;
+    const int* eliminated_entry;
+    const int* diagonal_block;  // (nodes + 1)
+    double* blocks;             // (2, blocks, 2, 36) direct and eliminated, as the system
+
+    // Its factor in tiles, sorted by the level at which their column can be eliminated.
+    const int* tile_row;
+    const int* tile_column;
+    const int* tile_first;      // where a tile's products begin
+    const int* product_left;
+    const int* product_right;
+    const int* tile_block_first;
+    const int* tile_block;
+    const int* column_diagonal; // (sides) tile of the diagonal
+    const int* column_first;    // (sides + 1) where a column's tiles below the diagonal begin
+    const int* column_tile;
+    const int* level_column;    // columns by level
+    double* factor;             // (tiles, 48, 48)
+    double* diagonal_factor;    // (sides, 48, 48)
+    double* scale;              // (48 sides)
+    double* solution;           // (48 sides)
+
+    Control* control;
+    double* report;             // (10) see `finish`
+};
+
+#ifdef CONTEXT_BYTES
+static_assert(sizeof(Context) == CONTEXT_BYTES, "the context and its mirror differ");
+static_assert(sizeof(Control) <= CONTROL_BYTES, "the control does not fit");
+#endif
+
+__device__ inline i64 triangle(i64 row, i64 column) { return row * (row + 1) / 2 + column; }
+
+__device__ inline int num_free(const Context& c) { return (int)(c.focal_free + c.alpha_free); }
+
+// Scalars of an edge's 9x9 (8x8, 7x7) product that are kept, padded to what a warp writes at once.
+__device__ inline int product_stride(int intrinsics) { return intrinsics == 0 ? 32 : intrinsics == 1 ? 40 : 48; }
+
+// Floats that a unit leaves per slice: its products over pairs of slots, those of its edges, and two costs of priors.
+__device__ inline i64 partial_size(int count, int depth_free, int intrinsics) {
+    return (depth_free ? triangle(count + 1, 0) * 36 : 0) + (i64)count * product_stride(intrinsics) + 2;
+}
+
+__device__ inline double robust_cost(int kernel, double scale, double squared) {
+    double c2 = scale * scale;
+    switch (kernel) {
+        case HUBER: return squared <= c2 ? squared : 2 * scale * sqrt(squared) - c2;
+        case CAUCHY: return c2 * log1p(squared / c2);
+        case TUKEY: {
+            double inside = 1 - squared / c2;
+            inside = inside < 0 ? 0 : inside;
+            return c2 / 3 * (1 - inside * inside * inside);
+        }
+        case GEMAN_MCCLURE: return squared * (c2 / (c2 + squared));
+        default: return squared;
+    }
+}
+
+// The state that the pass in hand linearises.
+__device__ inline i64 linearised_state(const Control& control) {
+    return control.mode == STEP ? 1 - control.state : control.state;
+}

@@ -1,0 +1,181 @@
+// One cell seen by one edge: ray, projection, robust weight and derivatives, in single precision.
+//
+// Unified model: s = z + alpha |X|, pixel = f (x, y) / s + c; pinhole is alpha = 0 with rays of z = 1. See
+// `vipe_core/cameras/projection.py` for its rays and their derivatives, `vipe_core/ba/torch_solver.py` for the algebra.
+
+struct Camera {
+    float fx, fy, cx, cy, alpha;
+};
+
+__device__ inline Camera camera_of(const Context& c, i64 state) {
+    const double* k = c.intrinsics + 5 * state;
+    return Camera{(float)k[0], (float)k[1], (float)k[2], (float)k[3], (float)k[4]};
+}
+
+// Rows of the rays in shared memory: x, y[, z], least s, then the derivatives by log f and alpha.
+template <bool UNIFIED, bool FOCAL, bool ALPHA>
+struct Rays {
+    static constexpr int LEAST = UNIFIED ? 3 : 2;
+    static constexpr int BY_FOCAL = LEAST + 1;
+    static constexpr int BY_ALPHA = BY_FOCAL + (UNIFIED && FOCAL ? 3 : 0);
+    static constexpr int ROWS = BY_ALPHA + (UNIFIED && ALPHA ? 3 : 0);
+};
+#define MAX_RAY_ROWS 10
+
+// Fill the rays of a tile; thread p < TILE does cell p.
+template <bool UNIFIED, bool FOCAL, bool ALPHA>
+__device__ inline void fill_rays(const Context& c, i64 state, i64 cell, int p, float* rays) {
+    using R = Rays<UNIFIED, FOCAL, ALPHA>;
+    const double* k = c.intrinsics + 5 * state;
+    const int width = (int)c.width;
+    float mx = ((float)((int)cell % width) * (float)c.stride + (float)(c.offset - k[2])) / (float)k[0];
+    float my = ((float)((int)cell / width) * (float)c.stride + (float)(c.offset - k[3])) / (float)k[1];
+    if constexpr (!UNIFIED) {
+        rays[p] = mx;
+        rays[TILE + p] = my;
+        rays[R::LEAST * TILE + p] = (float)c.min_depth_ratio;
+    } else {
+        float alpha = (float)k[4], r2 = mx * mx + my * my, bend = 1.0f - alpha * alpha, squared = 1.0f + bend * r2;
+        bool on_disk = squared > 1e-6f;
+        float g = sqrtf(on_disk ? squared : 1e-6f), share = 1.0f / (1.0f + r2), eta = (alpha + g) * share;
+        rays[p] = eta * mx;
+        rays[TILE + p] = eta * my;
+        rays[2 * TILE + p] = eta - alpha;
+        // The ray has unit length, so s starts at eta.
+        rays[R::LEAST * TILE + p] = on_disk && eta > 0.0f ? (float)c.min_depth_ratio * eta : 3.4e38f;
+        if constexpr (FOCAL) {
+            float slope = (2.0f * r2 * eta - bend * r2 / g) * share;
+            rays[R::BY_FOCAL * TILE + p] = (slope - eta) * mx;
+            rays[(R::BY_FOCAL + 1) * TILE + p] = (slope - eta) * my;
+            rays[(R::BY_FOCAL + 2) * TILE + p] = slope;
+        }
+        if constexpr (ALPHA) {
+            float slope = (1.0f - alpha * r2 / g) * share;
+            rays[R::BY_ALPHA * TILE + p] = slope * mx;
+            rays[(R::BY_ALPHA + 1) * TILE + p] = slope * my;
+            rays[(R::BY_ALPHA + 2) * TILE + p] = slope - 1.0f;
+        }
+    }
+}
+
+struct View {
+    float x, y, z, inverse, px, py, norm;  // homogeneous point, 1 / s, (x, y) / s, |X|
+    float eu, ev, su, sv;                  // weighted residual, roots of the weights; zero where not imaged
+    float squared, weight, all_weight;     // argument of the robust kernel, larger weight where imaged and at all
+};
+
+// Where a cell with a ray and an inverse depth is seen. `inside` is false for what pads the last tile.
+template <bool UNIFIED, bool FOCAL, bool ALPHA>
+__device__ inline View see(const Camera& camera, const float* transform, const float* rays, int p, float depth,
+                           float2 target, float2 weight, bool inside) {
+    using R = Rays<UNIFIED, FOCAL, ALPHA>;
+    View view;
+    float a = rays[p], b = rays[TILE + p], least = rays[R::LEAST * TILE + p], s;
+    bool imaged;
+    if constexpr (UNIFIED) {
+        float c = rays[2 * TILE + p];
+        view.x = transform[0] * a + transform[1] * b + transform[2] * c + transform[3] * depth;
+        view.y = transform[4] * a + transform[5] * b + transform[6] * c + transform[7] * depth;
+        view.z = transform[8] * a + transform[9] * b + transform[10] * c + transform[11] * depth;
+        view.norm = sqrtf(view.x * view.x + view.y * view.y + view.z * view.z);
+        s = view.z + camera.alpha * view.norm;
+        imaged = s > least && camera.alpha * view.z + view.norm > 0.0f;
+    } else {
+        view.x = transform[0] * a + transform[1] * b + transform[2] + transform[3] * depth;
+        view.y = transform[4] * a + transform[5] * b + transform[6] + transform[7] * depth;
+        view.z = transform[8] * a + transform[9] * b + transform[10] + transform[11] * depth;
+        view.norm = 1.0f;
+        s = view.z;
+        imaged = s > least;
+    }
+    float wu = inside ? weight.x : 0.0f, wv = inside ? weight.y : 0.0f;
+    wu = wu < 0.0f ? 0.0f : wu;
+    wv = wv < 0.0f ? 0.0f : wv;
+    view.inverse = 1.0f / (imaged ? s : 1.0f);
+    view.norm = imaged ? view.norm : 1.0f;
+    view.px = view.x * view.inverse;
+    view.py = view.y * view.inverse;
+    // A component without weight has no say, whatever it holds.
+    float eu = wu > 0.0f ? camera.fx * view.px + camera.cx - target.x : 0.0f;
+    float ev = wv > 0.0f ? camera.fy * view.py + camera.cy - target.y : 0.0f;
+    // Written so that a weight that is not a number stays one.
+    view.all_weight = wu > wv ? wu : wv == wv ? (wu == wu ? wv : wu) : wv;
+    wu = imaged ? wu : 0.0f;
+    wv = imaged ? wv : 0.0f;
+    view.weight = imaged ? view.all_weight : 0.0f;
+    view.su = sqrtf(wu);
+    view.sv = sqrtf(wv);
+    view.eu = imaged ? eu * view.su : 0.0f;
+    view.ev = imaged ? ev * view.sv : 0.0f;
+    view.squared = (view.eu * view.eu + view.ev * view.ev) / (view.weight > 1e-37f ? view.weight : 1e-37f);
+    return view;
+}
+
+template <int ROBUST>
+__device__ inline float rho(float scale, float c2, float s) {
+    if constexpr (ROBUST == HUBER) return s > c2 ? 2.0f * scale * sqrtf(s) - c2 : s;
+    if constexpr (ROBUST == CAUCHY) return c2 * log1pf(s / c2);
+    if constexpr (ROBUST == GEMAN_MCCLURE) return s * c2 / (c2 + s);
+    if constexpr (ROBUST == TUKEY) {
+        float inside = 1.0f - s / c2;
+        inside = inside < 0.0f ? 0.0f : inside;
+        return c2 / 3.0f * (1.0f - inside * inside * inside);
+    }
+    return s;
+}
+
+// Scale residuals and roots of weights by sqrt(rho'(s)).
+template <int ROBUST>
+__device__ inline void reweigh(float c2, View& view) {
+    float root;
+    if constexpr (ROBUST == NONE) return;
+    if constexpr (ROBUST == HUBER) root = sqrtf(sqrtf(c2 / (view.squared > c2 ? view.squared : c2)));
+    if constexpr (ROBUST == CAUCHY) root = 1.0f / sqrtf(1.0f + view.squared / c2);
+    if constexpr (ROBUST == GEMAN_MCCLURE) root = c2 / (c2 + view.squared);
+    if constexpr (ROBUST == TUKEY) {
+        root = 1.0f - view.squared / c2;
+        root = root < 0.0f ? 0.0f : root;
+    }
+    view.eu *= root;
+    view.ev *= root;
+    view.su *= root;
+    view.sv *= root;
+}
+
+// Derivatives of the pixel by the point, scaled: J_X = g (1 - (px, py) slope^T), slope = e_z + alpha X / |X|.
+struct ByPoint {
+    float gu, gv, hx, hy, hz;
+};
+
+template <bool UNIFIED>
+__device__ inline ByPoint by_point(const Camera& camera, const View& view) {
+    float bend = UNIFIED ? camera.alpha / view.norm : 0.0f;
+    return ByPoint{view.su * camera.fx * view.inverse, view.sv * camera.fy * view.inverse, bend * view.x,
+                   bend * view.y, 1.0f + bend * view.z};
+}
+
+// How a direction in space moves the scaled pixel.
+template <bool UNIFIED>
+__device__ inline float2 push(const ByPoint& j, const View& view, float x, float y, float z) {
+    float slope = UNIFIED ? j.hx * x + j.hy * y + j.hz * z : z;
+    return float2{j.gu * (x - view.px * slope), j.gv * (y - view.py * slope)};
+}
+
+// Derivative of a cell's homogeneous point by an intrinsic (row of the rays), times a step.
+template <bool UNIFIED, bool FOCAL, bool ALPHA, bool BY_ALPHA>
+__device__ inline void ray_change(const float* transform, const float* rays, int p, float& x, float& y, float& z) {
+    using R = Rays<UNIFIED, FOCAL, ALPHA>;
+    float a, b, c = 0.0f;
+    if constexpr (UNIFIED) {
+        const int row = BY_ALPHA ? R::BY_ALPHA : R::BY_FOCAL;
+        a = rays[row * TILE + p];
+        b = rays[(row + 1) * TILE + p];
+        c = rays[(row + 2) * TILE + p];
+    } else {
+        a = -rays[p];
+        b = -rays[TILE + p];
+    }
+    x = transform[0] * a + transform[1] * b + transform[2] * c;
+    y = transform[4] * a + transform[5] * b + transform[6] * c;
+    z = transform[8] * a + transform[9] * b + transform[10] * c;
+}

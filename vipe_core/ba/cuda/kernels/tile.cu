@@ -1,0 +1,340 @@
+// The pass over the cells: finish the proposed step, then the cost and normal equations of what it leads to.
+//
+// One block takes a slice of the cells of a unit, `TILE` at a time; a warp takes edges, a lane two cells. What an edge
+// says of its own twist is summed in registers and reduced over the lanes by exchange of halves. What eliminating the
+// depths subtracts is a matrix times itself: the rows of all edges of a tile are laid out in shared memory, and
+// threads take pairs of slots (six rows of an edge, or the tail: intrinsics and right-hand side).
+//
+// The step of a depth needs the rows of the previous linearisation. They are made again from the measurements, which
+// this pass reads anyway, and are never stored.
+
+// Numbers a unit of `count` edges needs for the rows and the products of a tile.
+struct TileLayout {
+    int slots, pairs, groups, stride, items;
+    __device__ TileLayout(int count, int depth_free) {
+        slots = depth_free ? count + 1 : 0;
+        pairs = slots * (slots + 1) / 2;
+        // Several threads share a pair where there are few: a power of two, at most one per four cells.
+        groups = 1;
+        while (groups < TILE / 4 && 2 * groups * pairs <= TILE_THREADS) groups *= 2;
+        // Rows end on different banks.
+        stride = TILE + (groups < 8 ? 4 * groups : 0);
+        items = pairs * groups;
+    }
+    __device__ i64 rows() const { return (i64)6 * slots * stride; }
+    __device__ i64 products() const { return (i64)36 * items; }
+};
+
+#define FIXED_FLOATS (MAX_RAY_ROWS * TILE + 2 * TILE + TILE_WARPS * 4 * TILE)
+
+// Sum v[OFFSET ... OFFSET + N) over the lanes of a warp, N a power of two; lane l is left with number l % N. Recursive,
+// since an array stays in registers only where every index is known to the compiler.
+template <int OFFSET, int N, int SIZE, int HALF = N / 2>
+__device__ inline float exchange_halves(float (&v)[SIZE], int lane) {
+    if constexpr (HALF >= 1) {
+        const bool upper = (lane & HALF) != 0;
+#pragma unroll
+        for (int i = 0; i < HALF; ++i) {
+            float sent = upper ? v[OFFSET + i] : v[OFFSET + i + HALF];
+            float kept = upper ? v[OFFSET + i + HALF] : v[OFFSET + i];
+            v[OFFSET + i] = kept + __shfl_xor_sync(0xffffffffu, sent, HALF);
+        }
+        return exchange_halves<OFFSET, N, SIZE, HALF / 2>(v, lane);
+    } else {
+        float total = v[OFFSET];
+#pragma unroll
+        for (int mask = N; mask < 32; mask *= 2) total += __shfl_xor_sync(0xffffffffu, total, mask);
+        return total;
+    }
+}
+
+// Products of the rows of two slots over the cells of a tile that belong to one item.
+__device__ inline void multiply(const float* rows, const TileLayout& at, int item, float* products) {
+    int pair = item / at.groups, group = item % at.groups;
+    int i = (int)((sqrtf(8.0f * (float)pair + 1.0f) - 1.0f) * 0.5f);
+    while ((i + 1) * (i + 2) / 2 <= pair) ++i;
+    while (i * (i + 1) / 2 > pair) --i;
+    int j = pair - i * (i + 1) / 2;
+    const float* left = rows + i * at.stride;
+    const float* right = rows + j * at.stride;
+    const int step = at.slots * at.stride;
+    float sum[36];
+#pragma unroll
+    for (int k = 0; k < 36; ++k) sum[k] = 0.0f;
+    for (int p = 4 * group; p < TILE; p += 4 * at.groups) {
+        float4 b[6];
+#pragma unroll
+        for (int k = 0; k < 6; ++k) b[k] = *(const float4*)(right + k * step + p);
+#pragma unroll
+        for (int r = 0; r < 6; ++r) {
+            float4 a = *(const float4*)(left + r * step + p);
+#pragma unroll
+            for (int k = 0; k < 6; ++k)
+                sum[6 * r + k] += a.x * b[k].x + a.y * b[k].y + a.z * b[k].z + a.w * b[k].w;
+        }
+    }
+#pragma unroll
+    for (int k = 0; k < 36; ++k) products[k * at.items + item] += sum[k];
+}
+
+// LARGE units keep rows and products in `scratch`: slower, with the same bits.
+template <bool UNIFIED, bool FOCAL, bool ALPHA, int ROBUST, bool LARGE>
+__device__ inline void tile_pass(const Context& c, int first_unit, float* shared) {
+    constexpr int INTRINSICS = FOCAL + ALPHA, TWIST = 6, RIGHT = TWIST + INTRINSICS;
+    constexpr int PRODUCTS = RIGHT * (RIGHT + 1) / 2 + RIGHT;  // lower triangle without its last corner
+    constexpr int STRIDE = INTRINSICS == 0 ? 32 : INTRINSICS == 1 ? 40 : 48;
+    const Control& control = *c.control;
+    if (control.done || control.mode == IDLE) return;
+    const bool step = control.mode == STEP;
+    const i64 now = control.state, next = linearised_state(control), P = c.num_cells;
+    const int thread = threadIdx.x, warp = thread / 32, lane = thread % 32;
+    const int unit = first_unit + (int)(blockIdx.x / c.num_slices);
+    const i64 slice = blockIdx.x % c.num_slices;
+    const int frame = c.unit_frame[unit], first = c.unit_first[unit], count = c.unit_count[unit];
+    const int depth_free = c.unit_free[unit];
+    const TileLayout at(count, depth_free);
+
+    float* rays = shared;
+    float* depths = rays + MAX_RAY_ROWS * TILE;
+    float* root_q = depths + TILE;
+    float* tails = root_q + TILE;  // (warps, 4, TILE)
+    float* rows = shared + FIXED_FLOATS;
+    if (LARGE)
+        rows = c.scratch + (i64)blockIdx.x * c.scratch_stride;
+    float* products = rows + at.rows();
+    float* edges = products + at.products();  // (count, STRIDE)
+    for (i64 k = thread; k < at.products() + (i64)count * STRIDE; k += TILE_THREADS) products[k] = 0.0f;
+
+    const Camera before = camera_of(c, now), camera = camera_of(c, next);
+    const float scale_now = (float)control.scale_system;
+    const float scale_judge = (float)control.scale_judge, scale_next = (float)control.scale_next;
+    const float c2_now = scale_now * scale_now, c2_judge = scale_judge * scale_judge;
+    const float c2_next = scale_next * scale_next;
+    const bool one_scale = scale_judge == scale_next;
+    const float grown = 1.0f + (float)control.damping;
+    float prior_cost = 0.0f;
+
+    const i64 end = (slice + 1) * SLICE < P ? (slice + 1) * SLICE : P;
+    for (i64 start = slice * SLICE; start < end; start += TILE) {
+        const i64 cell = start + thread;  // of the thread that keeps a cell's sums
+        const bool keeper = thread < TILE, real = keeper && cell < P;
+        float prior_value = 0.0f, prior_weight = 0.0f, depth = 0.0f;
+        __syncthreads();  // nobody reads the previous tile any more
+        if (keeper) {
+            const i64 near = cell < P ? cell : P - 1;
+            depth = c.depth[(now * c.num_frames + frame) * P + near];
+            depths[thread] = depth;
+            if (depth_free && c.has_prior && real) {
+                prior_weight = c.prior_weight[(i64)frame * P + cell];
+                prior_value = prior_weight > 0.0f ? c.prior_value[(i64)frame * P + cell] : depth;
+            }
+            fill_rays<UNIFIED, FOCAL, ALPHA>(c, step && depth_free ? now : next, near, thread, rays);
+        }
+        __syncthreads();
+
+        if (step && depth_free) {
+            float curvature[2] = {0.0f, 0.0f}, left[2] = {0.0f, 0.0f};
+            for (int m = warp; m < count; m += TILE_WARPS) {
+                const i64 edge = first + m, row = (i64)c.edge_id[edge] * P;
+                const float* transform = c.edge_transform + (now * c.num_edges + edge) * 12;
+                const float* twist = c.edge_twist + edge * 8;
+#pragma unroll
+                for (int h = 0; h < 2; ++h) {
+                    const int p = lane + 32 * h;
+                    const bool inside = start + p < P;
+                    const i64 at_cell = row + (inside ? start + p : P - 1);
+                    View view = see<UNIFIED, FOCAL, ALPHA>(before, transform, rays, p, depths[p],
+                                                           ((const float2*)c.target_px)[at_cell],
+                                                           ((const float2*)c.weight)[at_cell], inside);
+                    reweigh<ROBUST>(c2_now, view);
+                    const ByPoint j = by_point<UNIFIED>(before, view);
+                    const float2 d = push<UNIFIED>(j, view, transform[3], transform[7], transform[11]);
+                    float x = twist[0] * depths[p] + twist[4] * view.z - twist[5] * view.y;
+                    float y = twist[1] * depths[p] + twist[5] * view.x - twist[3] * view.z;
+                    float z = twist[2] * depths[p] + twist[3] * view.y - twist[4] * view.x;
+                    float share = 0.0f;
+                    if constexpr (FOCAL) {
+                        float a, b, e;
+                        ray_change<UNIFIED, FOCAL, ALPHA, false>(transform, rays, p, a, b, e);
+                        x += twist[6] * a;
+                        y += twist[6] * b;
+                        z += twist[6] * e;
+                        share += twist[6];
+                    }
+                    if constexpr (ALPHA) {
+                        float a, b, e;
+                        ray_change<UNIFIED, FOCAL, ALPHA, true>(transform, rays, p, a, b, e);
+                        x += twist[7] * a;
+                        y += twist[7] * b;
+                        z += twist[7] * e;
+                        share -= twist[7] * view.norm * view.inverse;
+                    }
+                    float2 moved = push<UNIFIED>(j, view, x, y, z);
+                    // Both camera derivatives are multiples of f (px, py).
+                    moved.x += view.su * before.fx * view.px * share;
+                    moved.y += view.sv * before.fy * view.py * share;
+                    curvature[h] += d.x * d.x + d.y * d.y;
+                    left[h] -= d.x * (view.eu + moved.x) + d.y * (view.ev + moved.y);
+                }
+            }
+#pragma unroll
+            for (int h = 0; h < 2; ++h) {
+                float* sums = tails + warp * 4 * TILE + lane + 32 * h;
+                sums[0] = curvature[h];
+                sums[TILE] = left[h];
+            }
+            __syncthreads();
+            if (keeper) {
+                float total = prior_weight, pull = prior_weight * (prior_value - depth);
+                for (int w = 0; w < TILE_WARPS; ++w) {
+                    total += tails[(w * 4) * TILE + thread];
+                    pull += tails[(w * 4 + 1) * TILE + thread];
+                }
+                depth += total > TINY ? pull / (total * grown) : 0.0f;
+                // Single precision of the bounds, as the state is.
+                const float median = *c.median, low = (float)c.min_depth * median, high = (float)c.max_depth * median;
+                depth = depth < low ? low : depth > high ? high : depth;
+                depths[thread] = depth;
+                if (real) c.depth[(next * c.num_frames + frame) * P + cell] = depth;
+                fill_rays<UNIFIED, FOCAL, ALPHA>(c, next, real ? cell : P - 1, thread, rays);
+            }
+            __syncthreads();
+        }
+
+        float tail[2][INTRINSICS + 2];  // intrinsics, right-hand side, curvature
+#pragma unroll
+        for (int h = 0; h < 2; ++h)
+#pragma unroll
+            for (int k = 0; k < INTRINSICS + 2; ++k) tail[h][k] = 0.0f;
+        for (int m = warp; m < count; m += TILE_WARPS) {
+            const i64 edge = first + m, row = (i64)c.edge_id[edge] * P;
+            const float* transform = c.edge_transform + (next * c.num_edges + edge) * 12;
+            float sums[STRIDE];
+#pragma unroll
+            for (int k = 0; k < STRIDE; ++k) sums[k] = 0.0f;
+#pragma unroll
+            for (int h = 0; h < 2; ++h) {
+                const int p = lane + 32 * h;
+                const bool inside = start + p < P;
+                const i64 at_cell = row + (inside ? start + p : P - 1);
+                View view = see<UNIFIED, FOCAL, ALPHA>(camera, transform, rays, p, depths[p],
+                                                       ((const float2*)c.target_px)[at_cell],
+                                                       ((const float2*)c.weight)[at_cell], inside);
+                const float cost = view.weight * rho<ROBUST>(scale_judge, c2_judge, view.squared);
+                sums[PRODUCTS] += cost;
+                sums[PRODUCTS + 1] +=
+                    one_scale ? cost : view.weight * rho<ROBUST>(scale_next, c2_next, view.squared);
+                sums[PRODUCTS + 2] += view.weight;
+                sums[PRODUCTS + 3] += view.all_weight;
+                reweigh<ROBUST>(c2_next, view);
+
+                const ByPoint j = by_point<UNIFIED>(camera, view);
+                const float au = j.gu * view.px, av = j.gv * view.py, d = depths[p];
+                const float u0 = j.gu - au * j.hx, u1 = -au * j.hy, u2 = -au * j.hz;
+                const float v0 = -av * j.hx, v1 = j.gv - av * j.hy, v2 = -av * j.hz;
+                float u[RIGHT + 1], v[RIGHT + 1];
+                u[0] = d * u0;
+                u[1] = d * u1;
+                u[2] = d * u2;
+                u[3] = view.y * u2 - view.z * u1;
+                u[4] = view.z * u0 - view.x * u2;
+                u[5] = view.x * u1 - view.y * u0;
+                v[0] = d * v0;
+                v[1] = d * v1;
+                v[2] = d * v2;
+                v[3] = view.y * v2 - view.z * v1;
+                v[4] = view.z * v0 - view.x * v2;
+                v[5] = view.x * v1 - view.y * v0;
+                if constexpr (FOCAL) {
+                    float a, b, e;
+                    ray_change<UNIFIED, FOCAL, ALPHA, false>(transform, rays, p, a, b, e);
+                    u[TWIST] = u0 * a + u1 * b + u2 * e + view.su * camera.fx * view.px;
+                    v[TWIST] = v0 * a + v1 * b + v2 * e + view.sv * camera.fy * view.py;
+                }
+                if constexpr (ALPHA) {
+                    float a, b, e;
+                    const float share = view.norm * view.inverse;
+                    ray_change<UNIFIED, FOCAL, ALPHA, true>(transform, rays, p, a, b, e);
+                    u[RIGHT - 1] = u0 * a + u1 * b + u2 * e - share * view.su * camera.fx * view.px;
+                    v[RIGHT - 1] = v0 * a + v1 * b + v2 * e - share * view.sv * camera.fy * view.py;
+                }
+                u[RIGHT] = -view.eu;
+                v[RIGHT] = -view.ev;
+#pragma unroll
+                for (int r = 0; r <= RIGHT; ++r)
+#pragma unroll
+                    for (int k = 0; k <= r; ++k)
+                        if (k < RIGHT) sums[r * (r + 1) / 2 + k] += u[r] * u[k] + v[r] * v[k];
+                if (depth_free) {
+                    const float du = u0 * transform[3] + u1 * transform[7] + u2 * transform[11];
+                    const float dv = v0 * transform[3] + v1 * transform[7] + v2 * transform[11];
+#pragma unroll
+                    for (int r = 0; r < TWIST; ++r)
+                        rows[(r * at.slots + m) * at.stride + p] = u[r] * du + v[r] * dv;
+#pragma unroll
+                    for (int k = 0; k <= INTRINSICS; ++k) tail[h][k] += u[TWIST + k] * du + v[TWIST + k] * dv;
+                    tail[h][INTRINSICS + 1] += du * du + dv * dv;
+                }
+            }
+            const float whole = exchange_halves<0, 32>(sums, lane);
+            edges[(i64)m * STRIDE + lane] += whole;
+            if constexpr (STRIDE > 32) {
+                const float rest = exchange_halves<32, STRIDE - 32>(sums, lane);
+                if (lane < STRIDE - 32) edges[(i64)m * STRIDE + 32 + lane] += rest;
+            }
+        }
+        if (!depth_free) continue;
+
+#pragma unroll
+        for (int h = 0; h < 2; ++h)
+#pragma unroll
+            for (int k = 0; k < INTRINSICS + 2; ++k) tails[(warp * 4 + k) * TILE + lane + 32 * h] = tail[h][k];
+        __syncthreads();
+        if (keeper) {
+            const float off = prior_value - depth;
+            float total[INTRINSICS + 2];
+#pragma unroll
+            for (int k = 0; k < INTRINSICS + 2; ++k) total[k] = 0.0f;
+            total[INTRINSICS] = real ? prior_weight * off : 0.0f;
+            total[INTRINSICS + 1] = prior_weight;
+            prior_cost += prior_weight > 0.0f ? prior_weight * off * off : 0.0f;
+            for (int w = 0; w < TILE_WARPS; ++w)
+#pragma unroll
+                for (int k = 0; k < INTRINSICS + 2; ++k) total[k] += tails[(w * 4 + k) * TILE + thread];
+            const float seen = total[INTRINSICS + 1];
+            root_q[thread] = seen > TINY ? 1.0f / sqrtf(seen) : 0.0f;
+#pragma unroll
+            for (int k = 0; k < 6; ++k)
+                rows[(k * at.slots + count) * at.stride + thread] = k <= INTRINSICS ? total[k] : 0.0f;
+        }
+        __syncthreads();
+        for (int row = warp; row < 6 * at.slots; row += TILE_WARPS)
+#pragma unroll
+            for (int h = 0; h < 2; ++h) rows[row * at.stride + lane + 32 * h] *= root_q[lane + 32 * h];
+        __syncthreads();
+        for (int item = thread; item < at.items; item += TILE_THREADS) multiply(rows, at, item, products);
+    }
+    __syncthreads();
+
+    const i64 size = partial_size(count, depth_free, INTRINSICS);
+    float* out = c.partial + c.unit_partial[unit] + slice * size;
+    for (int k = thread; k < 36 * at.pairs; k += TILE_THREADS) {
+        const int pair = k / 36, value = k % 36;
+        float sum = 0.0f;
+        for (int g = 0; g < at.groups; ++g) sum += products[value * at.items + pair * at.groups + g];
+        out[k] = sum;
+    }
+    out += 36 * at.pairs;
+    for (int k = thread; k < count * STRIDE; k += TILE_THREADS) out[k] = edges[k];
+    out += count * STRIDE;
+#pragma unroll
+    for (int mask = 16; mask >= 1; mask /= 2) prior_cost += __shfl_xor_sync(0xffffffffu, prior_cost, mask);
+    if (lane == 0 && warp < TILE / 32) out[warp] = prior_cost;
+}
+
+#define DEFINE_TILE_KERNEL(NAME, UNIFIED, FOCAL, ALPHA, ROBUST, LARGE, BLOCKS)                              \
+    extern "C" __global__ void __launch_bounds__(TILE_THREADS, BLOCKS)                                      \
+        NAME(const Context context, int first_unit) {                                                       \
+        DYNAMIC_SHARED(shared);                                                                             \
+        tile_pass<UNIFIED, FOCAL, ALPHA, ROBUST, LARGE>(context, first_unit, shared);                       \
+    }

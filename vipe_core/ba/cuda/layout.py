@@ -1,0 +1,291 @@
+"""The shape of a bundle adjustment for the CUDA kernels, worked out on the host once per graph.
+
+Edges are ordered by (source, target). Those of a frame whose depths are eliminated make one unit, those of a frame
+whose depths are held are split. Free poses are numbered in an order of elimination with little fill; the tail (free
+intrinsics and the right-hand side) comes last. Every 6x6 block of the reduced system knows which blocks of the units it
+sums, and every 48x48 tile of its factor which products it subtracts, so the kernels need no atomics and no search.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vipe_core.ba import block_cholesky
+
+Ints = NDArray[np.int64]
+Array = NDArray[Any]
+
+# As in `kernels/context.cu` and `kernels/tile.cu`.
+TILE = 64
+SLICE = 256
+TILE_THREADS = 128
+SIDE_BLOCKS = 8
+SIDE = 6 * SIDE_BLOCKS
+_FIXED_FLOATS = 10 * TILE + 2 * TILE + TILE_THREADS // 32 * 4 * TILE
+_PRODUCT_STRIDE = (32, 40, 48)
+
+# What every GPU since compute capability 8.0 can give a block of threads: 99 KiB.
+_MAX_SHARED_FLOATS = 99 * 256
+# Edges of a frame whose depths are held that one block of threads takes.
+_HELD_EDGES = 16
+
+
+@dataclass(frozen=True, slots=True)
+class Layout:
+    """What the kernels look up, and how many blocks of threads each needs.
+
+    Attributes:
+        tables: Arrays by their name in `Context`, int32 but for offsets in int64.
+        num_large: Units too large for shared memory; they come first.
+        shared_bytes: Dynamic shared memory of the pass over the others.
+        scratch_stride: Numbers that a block of threads of the large ones needs instead.
+        partial_size, pool_size: Numbers in `partial` and blocks in `pool`.
+        num_nodes: Free poses that an edge touches.
+        level_tiles: (levels + 1) where the tiles of each level begin.
+        level_columns: (levels + 1) where its columns begin.
+    """
+
+    tables: dict[str, Array]
+    num_large: int
+    shared_bytes: int
+    scratch_stride: int
+    partial_size: int
+    pool_size: int
+    num_nodes: int
+    level_tiles: tuple[int, ...]
+    level_columns: tuple[int, ...]
+
+    @property
+    def num_units(self) -> int:
+        return len(self.tables["unit_frame"])
+
+    @property
+    def num_blocks(self) -> int:
+        return len(self.tables["block_row"])
+
+    @property
+    def num_tiles(self) -> int:
+        return len(self.tables["tile_row"])
+
+    @property
+    def num_sides(self) -> int:
+        return len(self.tables["column_diagonal"])
+
+
+def unit_floats(count: int, depth_free: bool, intrinsics: int) -> int:
+    """Numbers for the rows and products of a tile of a unit of `count` edges (`TileLayout` of the kernel)."""
+    slots = count + 1 if depth_free else 0
+    pairs = slots * (slots + 1) // 2
+    groups = 1
+    while groups < TILE // 4 and 2 * groups * pairs <= TILE_THREADS:
+        groups *= 2
+    stride = TILE + (4 * groups if groups < 8 else 0)
+    return 6 * slots * stride + 36 * pairs * groups + count * _PRODUCT_STRIDE[intrinsics]
+
+
+def build_layout(
+    source: Ints,
+    target: Ints,
+    free_poses: NDArray[np.bool_],
+    free_depths: NDArray[np.bool_],
+    cells: int,
+    intrinsics: int,
+) -> Layout:
+    """Lay out a graph.
+
+    Args:
+        source, target: (E,) frames of the edges, at least one edge.
+        free_poses, free_depths: (N,).
+        cells: Cells of a frame.
+        intrinsics: How many of log f and alpha are free.
+    """
+    num_frames, slices = len(free_poses), -(-cells // SLICE)
+    order = np.argsort(source * num_frames + target, kind="stable")
+    source, target = source[order], target[order]
+    first = np.zeros(num_frames + 1, np.int64)
+    first[1:] = np.cumsum(np.bincount(source, minlength=num_frames))
+
+    units, num_large = _units(first, free_depths, intrinsics)
+    frame, begin, count, free = units.T
+    touched = np.zeros(num_frames, bool)
+    touched[source] = touched[target] = True
+    frames = np.flatnonzero(free_poses & touched)
+    node = np.full(num_frames, -1, np.int64)
+    node[frames] = _order(frames, source, target, units, num_frames)
+    num_nodes = len(frames)
+
+    triangle = (count + 1) * (count + 2) // 2 * free
+    partial = (36 * triangle + count * _PRODUCT_STRIDE[intrinsics] + 2) * slices
+    direct = _starts(3 * count + 3)
+    eliminated = direct[-1] + _starts((count + 2) * (count + 3) // 2 * free)
+    tables = {
+        "frame_node": node,
+        "edge_id": order,
+        "edge_source": source,
+        "edge_target": target,
+        "unit_frame": frame,
+        "unit_first": begin,
+        "unit_count": count,
+        "unit_free": free,
+        "unit_partial": _starts(partial)[:-1],
+        "unit_direct": direct[:-1],
+        "unit_eliminated": eliminated[:-1],
+    }
+    floats = [unit_floats(int(n), bool(f), intrinsics) for n, f in zip(count, free, strict=True)]
+    tables |= _blocks(units, target, node, num_nodes, direct, eliminated)
+    factor, level_tiles, level_columns = _factor(tables["block_row"], tables["block_column"], num_nodes)
+    tables |= factor
+    wide = {"unit_partial", "unit_direct", "unit_eliminated"}
+    return Layout(
+        tables={name: table.astype(np.int64 if name in wide else np.int32) for name, table in tables.items()},
+        num_large=num_large,
+        shared_bytes=4 * (_FIXED_FLOATS + max(floats[num_large:], default=0)),
+        scratch_stride=-(-max(floats[:num_large], default=0) // 4) * 4,
+        partial_size=int(partial.sum()),
+        pool_size=int(eliminated[-1]),
+        num_nodes=num_nodes,
+        level_tiles=level_tiles,
+        level_columns=level_columns,
+    )
+
+
+LARGE_SHARED_BYTES = 4 * _FIXED_FLOATS
+"""Dynamic shared memory of the pass over large units."""
+
+
+def _starts(sizes: Ints) -> Ints:
+    starts = np.zeros(len(sizes) + 1, np.int64)
+    np.cumsum(sizes, out=starts[1:])
+    return starts
+
+
+def _units(first: Ints, free_depths: NDArray[np.bool_], intrinsics: int) -> tuple[Ints, int]:
+    """(U, 4) frame, first edge, edges, whether depths are free: large ones first, then by falling size."""
+    rows: list[tuple[bool, int, int, int, bool]] = []
+    for frame, free in enumerate(free_depths.tolist()):
+        begin, end = int(first[frame]), int(first[frame + 1])
+        piece = end - begin if free else _HELD_EDGES
+        for start in range(begin, end, max(piece, 1)):
+            count = min(piece, end - start)
+            small = _FIXED_FLOATS + unit_floats(count, free, intrinsics) <= _MAX_SHARED_FLOATS
+            rows.append((small, -count, frame, start, free))
+    rows.sort()
+    units = np.array([(frame, start, -count, free) for _, count, frame, start, free in rows], np.int64)
+    return units, sum(not small for small, *_ in rows)
+
+
+def _order(frames: Ints, source: Ints, target: Ints, units: Ints, num_frames: int) -> Ints:
+    """Place of each free pose in the order of elimination. A frame with free depths couples all poses that see it."""
+    number = np.full(num_frames, -1, np.int64)
+    number[frames] = np.arange(len(frames))
+    cliques: list[Sequence[int]] = []
+    for frame, begin, count, free in units.tolist():
+        own, others = int(number[frame]), number[target[begin : begin + count]]
+        seen = others[others >= 0].tolist()
+        if free:
+            cliques.append(seen + [own] * (own >= 0))
+        elif own >= 0:
+            cliques += [(own, other) for other in seen]
+    return block_cholesky.analyse(len(frames), cliques, dense_last=False).place
+
+
+def _blocks(units: Ints, target: Ints, node: Ints, num_nodes: int, direct: Ints, eliminated: Ints) -> dict[str, Array]:
+    """The blocks of the reduced system on and below the diagonal, and what each of them sums."""
+    tail = num_nodes
+    keys: list[Ints] = []
+    entries: list[Ints] = []
+    kinds: list[Ints] = []
+
+    def add(rows: Ints, columns: Ints, mixed: NDArray[np.bool_], block: Ints, kind: int) -> None:
+        """Sum `block` into (row, column), or its transpose into (column, row); both where two slots are one pose."""
+        for flip, chosen in ((0, rows >= columns), (1, (rows < columns) | (rows == columns) & mixed)):
+            use = chosen & (rows >= 0) & (columns >= 0)
+            low, high = np.minimum(rows, columns)[use], np.maximum(rows, columns)[use]
+            keys.append(high * (tail + 1) + low)
+            entries.append(2 * block[use] + flip)
+            kinds.append(np.full(int(use.sum()), kind))
+
+    # Units of one shape at a time.
+    for count, free in sorted({(int(c), int(f)) for c, f in units[:, 2:]}):
+        chosen = np.flatnonzero((units[:, 2] == count) & (units[:, 3] == free))
+        slots = np.full((len(chosen), count + 2), tail)
+        slots[:, 0] = node[units[chosen, 0]]
+        slots[:, 1:-1] = node[target[units[chosen, 1][:, None] + np.arange(count)]]
+        m = np.arange(count)
+        zero, end = np.zeros(count, np.int64), np.full(count, count + 1)
+        # Three blocks per edge: (target, target), (target, source), (tail, target); then (source, source) and so on.
+        rows = np.concatenate((np.stack((m + 1, m + 1, end), 1).ravel(), [0, count + 1, count + 1]))
+        columns = np.concatenate((np.stack((m + 1, zero, m + 1), 1).ravel(), [0, 0, count + 1]))
+        blocks = direct[chosen][:, None] + np.arange(3 * count + 3)
+        mixed = np.broadcast_to(rows != columns, blocks.shape)
+        add(slots[:, rows], slots[:, columns], mixed, blocks, 0)
+        if free:
+            rows, columns = np.tril_indices(count + 2)
+            blocks = eliminated[chosen][:, None] + np.arange(len(rows))
+            mixed = np.broadcast_to(rows != columns, blocks.shape)
+            add(slots[:, rows], slots[:, columns], mixed, blocks, 1)
+
+    key, entry, kind = np.concatenate(keys), np.concatenate(entries), np.concatenate(kinds)
+    unique = np.unique(key)
+    found: dict[str, Array] = {"block_row": unique // (tail + 1), "block_column": unique % (tail + 1)}
+    for name, code in (("direct", 0), ("eliminated", 1)):
+        at = np.searchsorted(unique, key[kind == code])
+        sorted_by = np.argsort(at, kind="stable")
+        found[f"{name}_first"] = _starts(np.bincount(at, minlength=len(unique)))
+        found[f"{name}_entry"] = entry[kind == code][sorted_by]
+    nodes = np.arange(num_nodes + 1)
+    found["diagonal_block"] = np.searchsorted(unique, nodes * (tail + 1) + nodes)
+    return found
+
+
+def _factor(
+    block_row: Ints, block_column: Ints, num_nodes: int
+) -> tuple[dict[str, Array], tuple[int, ...], tuple[int, ...]]:
+    """Tiles of the factor with its fill, by the level at which their column can be eliminated."""
+    num_sides = num_nodes // SIDE_BLOCKS + 1
+    below: list[set[int]] = [{num_sides - 1} for _ in range(num_sides)]
+    row_side, column_side = block_row // SIDE_BLOCKS, block_column // SIDE_BLOCKS
+    for row, column in {*zip(row_side.tolist(), column_side.tolist(), strict=True)}:
+        below[column].add(row)
+    for column in range(num_sides):
+        below[column].discard(column)
+        if below[column]:
+            below[min(below[column])] |= below[column]
+    before: list[list[int]] = [[] for _ in range(num_sides)]
+    level = [0] * num_sides
+    for column in range(num_sides):
+        level[column] = 1 + max((level[k] for k in before[column]), default=-1)
+        for row in below[column]:
+            if row != column:
+                before[row].append(column)
+
+    columns = sorted(range(num_sides), key=lambda j: (level[j], j))
+    tiles = [(i, j) for j in columns for i in (j, *sorted(below[j] - {j}))]
+    number = {tile: k for k, tile in enumerate(tiles)}
+    products = [[(number[i, k], number[j, k]) for k in before[j] if i == j or i in below[k]] for i, j in tiles]
+    flat = np.array([pair for some in products for pair in some], np.int64).reshape(-1, 2)
+    lower = [[number[i, j] for i in sorted(below[j] - {j})] for j in range(num_sides)]
+    of_block = np.array([number[tile] for tile in zip(row_side.tolist(), column_side.tolist(), strict=True)])
+    table: dict[str, Array] = {
+        "tile_row": np.array([i for i, _ in tiles]),
+        "tile_column": np.array([j for _, j in tiles]),
+        "tile_first": _starts(np.array([len(some) for some in products])),
+        "product_left": flat[:, 0],
+        "product_right": flat[:, 1],
+        "tile_block_first": _starts(np.bincount(of_block, minlength=len(tiles))),
+        "tile_block": np.argsort(of_block, kind="stable"),
+        "column_diagonal": np.array([number[j, j] for j in range(num_sides)]),
+        "column_first": _starts(np.array([len(some) for some in lower])),
+        "column_tile": np.array([tile for some in lower for tile in some], np.int64),
+        "level_column": np.array(columns),
+    }
+    per_column = np.array([1 + len(lower[j]) for j in columns])
+    sizes = np.bincount([level[j] for j in columns])
+    level_columns = _starts(sizes)
+    level_tiles = _starts(per_column)[level_columns]
+    return table, tuple(level_tiles.tolist()), tuple(level_columns.tolist())

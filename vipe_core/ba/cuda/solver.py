@@ -1,0 +1,310 @@
+"""A whole bundle adjustment on the GPU: buffers, the sequence of launches, and the one read of the result.
+
+`Adjustment` prepares a problem once; `run` only launches work on the current stream, always the same, so it can be
+captured in a CUDA graph and replayed after the tensors of problem and state were overwritten in place; `result` waits
+and reads. What each kernel does is in `kernels/*.cu`.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import math
+from functools import lru_cache
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from vipe_core.ba.cuda.compiler import ROBUST_CODE, Specialisation
+from vipe_core.ba.cuda.context import CONTROL_BYTES, REPORT_NUMBERS, Context
+from vipe_core.ba.cuda.launcher import Launcher
+from vipe_core.ba.cuda.layout import LARGE_SHARED_BYTES, SIDE, TILE, TILE_THREADS, Layout, build_layout
+from vipe_core.ba.problem import Covariance, Options, Problem, Result, State, Status
+from vipe_core.ba.solver import MIN_DAMPING
+
+# As in `kernels/context.cu`.
+_WIDE_THREADS = 256
+_FACTOR_THREADS = 256
+_ASSEMBLE_BLOCKS = 7
+_COVARIANCE_ATTEMPTS = 3
+_STATUS = (
+    Status.MAX_ITERATIONS,  # still running when the launches ended
+    Status.CONVERGED,
+    Status.MAX_ITERATIONS,
+    Status.NO_PROGRESS,
+    Status.SINGULAR,
+    Status.NON_FINITE,
+    Status.EMPTY,
+)
+
+
+def specialisation(problem: Problem, options: Options) -> Specialisation:
+    """The kernels that a problem needs."""
+    unified = problem.camera_model == "mei"
+    return Specialisation(unified, problem.free.focal, unified and problem.free.distortion, options.robust)
+
+
+class Adjustment:
+    """One problem, ready to be solved.
+
+    Args:
+        problem: Measurements and priors on one device in float32 (others are copied); the graph and what is free may be
+            on the host, which saves a wait for the device.
+        state: float32 inverse depths, on that device.
+        options: How to solve.
+        launcher: The kernels of `specialisation(problem, options)`.
+    """
+
+    def __init__(self, problem: Problem, state: State, options: Options, launcher: Launcher) -> None:
+        self._problem, self._state, self._options, self._launcher = problem, state, options, launcher
+        self._device = state.inverse_depth.device
+        edges, free, priors = problem.edges, problem.free, problem.priors
+        kind = specialisation(problem, options)
+        self._intrinsics_free = (kind.focal, kind.alpha)
+        self._layout = layout = _layout(
+            *(_bytes(frames, torch.int64) for frames in (edges.source, edges.target)),
+            *(_bytes(what, torch.bool) for what in (free.poses, free.inverse_depth)),
+            problem.grid.num_cells,
+            sum(self._intrinsics_free),
+        )
+        self._tensors: dict[str, Tensor] = {}
+        self._has_prior = priors.inverse_depth is not None and priors.inverse_depth_weight is not None
+        self._allocate(layout)
+        self._upload(layout)
+        self._context = self._fill_context(layout)
+        self._parameters = _Parameters(self._context)
+        self._levels = len(layout.level_columns) - 1
+        self._report: list[float] | None = None
+
+    # -- memory ----------------------------------------------------------------------------------------------------
+
+    def _allocate(self, layout: Layout) -> None:
+        edges, priors = self._problem.edges, self._problem.priors
+        frames, cells = self._state.inverse_depth.shape
+        count, single, double = len(edges.source), torch.float32, torch.float64
+        tensors = self._tensors
+        tensors["target_px"] = self._input(edges.target_px)
+        tensors["weight"] = self._input(edges.weight)
+        if self._has_prior and priors.inverse_depth is not None and priors.inverse_depth_weight is not None:
+            tensors["prior_value"] = self._input(priors.inverse_depth)
+            tensors["prior_weight"] = self._input(priors.inverse_depth_weight)
+        sides, tiles = layout.num_sides, layout.num_tiles
+        large_blocks = layout.num_large * self._slices
+        shapes: dict[str, tuple[torch.dtype, tuple[int, ...]]] = {
+            "finite": (torch.uint8, (1,)),
+            "median": (single, (1,)),
+            "largest": (single, (count,)),
+            "pose": (double, (2, frames, 16)),
+            "depth": (single, (2, frames, cells)),
+            "intrinsics": (double, (2, 5)),
+            "edge_transform": (single, (2, count, 12)),
+            "edge_adjoint": (double, (count, 36)),
+            "edge_twist": (single, (count, 8)),
+            "pose_step": (double, (6 * frames + 2,)),
+            "partial": (single, (layout.partial_size,)),
+            "scratch": (single, (large_blocks * layout.scratch_stride,)),
+            "pool": (double, (layout.pool_size, 36)),
+            "unit_sums": (double, (layout.num_units, 5)),
+            "blocks": (double, (2, layout.num_blocks, 2, 36)),
+            "factor": (double, (tiles, SIDE, SIDE)),
+            "diagonal_factor": (double, (sides, SIDE, SIDE)),
+            "scale": (double, (sides * SIDE,)),
+            "solution": (double, (sides * SIDE,)),
+            "control": (torch.uint8, (CONTROL_BYTES,)),
+            "report": (double, (REPORT_NUMBERS,)),
+        }
+        for name, (dtype, shape) in shapes.items():
+            tensors[name] = torch.empty(shape, dtype=dtype, device=self._device)
+
+    def _input(self, tensor: Tensor) -> Tensor:
+        return tensor.to(self._device, torch.float32).contiguous()
+
+    @property
+    def _slices(self) -> int:
+        return -(-self._problem.grid.num_cells // 256)
+
+    def _upload(self, layout: Layout) -> None:
+        """All tables in one copy."""
+        offsets, size = {}, 0
+        for name, table in layout.tables.items():
+            offsets[name] = size
+            size += -(-table.nbytes // 16) * 16
+        packed = np.zeros(size, np.uint8)
+        for name, table in layout.tables.items():
+            packed[offsets[name] : offsets[name] + table.nbytes] = np.frombuffer(table.tobytes(), np.uint8)
+        on_host = torch.from_numpy(packed)
+        self._tables = on_host.to(self._device)
+        self._table_offsets = offsets
+
+    def _fill_context(self, layout: Layout) -> Context:
+        problem, options, priors = self._problem, self._options, self._problem.priors
+        frames, cells = self._state.inverse_depth.shape
+        focal_free, alpha_free = self._intrinsics_free
+        any_depth = bool(layout.tables["unit_free"].any())
+        has_focal_prior = priors.log_focal is not None and focal_free
+        context = Context(
+            num_frames=frames,
+            num_edges=len(problem.edges.source),
+            num_cells=cells,
+            width=problem.grid.width,
+            num_units=layout.num_units,
+            num_slices=self._slices,
+            num_nodes=layout.num_nodes,
+            num_blocks=layout.num_blocks,
+            num_sides=layout.num_sides,
+            unified=problem.camera_model == "mei",
+            focal_free=focal_free,
+            alpha_free=alpha_free,
+            robust=ROBUST_CODE[options.robust],
+            anything_free=layout.num_nodes > 0 or focal_free or alpha_free or any_depth,
+            max_iterations=options.max_iterations,
+            has_prior=self._has_prior,
+            scratch_stride=layout.scratch_stride,
+            stride=problem.grid.stride,
+            offset=problem.grid.offset,
+            robust_scale=options.robust_scale_px,
+            first_scale=options.initial_scale_px or 0.0,
+            tolerance=options.relative_tolerance,
+            initial_damping=options.initial_damping,
+            min_damping=MIN_DAMPING[torch.float32],
+            min_depth_ratio=options.min_depth_ratio,
+            min_depth=options.min_inverse_depth,
+            max_depth=options.max_inverse_depth,
+            log_focal=np.ravel(priors.log_focal)[0] if has_focal_prior else 0.0,
+            log_focal_information=1 / priors.log_focal_sigma**2 if has_focal_prior else 0.0,
+        )
+        for name, tensor in self._tensors.items():
+            setattr(context, name, tensor.data_ptr())
+        for name, offset in self._table_offsets.items():
+            setattr(context, name, self._tables.data_ptr() + offset)
+        return context
+
+    # -- work ------------------------------------------------------------------------------------------------------
+
+    def run(self) -> None:
+        """Launch everything, without waiting for any of it. May be captured."""
+        self._report = None
+        self._launcher.open()
+        self._reset()
+        layout, options = self._layout, self._options
+        first = options.initial_scale_px
+        self._launch("begin", 1, 1)
+        if first is not None and math.isinf(first):
+            self._launch("transform", self._edge_blocks, _WIDE_THREADS)
+            self._launch("largest", len(self._problem.edges.source), TILE)
+            self._launch("widen", 1, _WIDE_THREADS)
+        # Graduated non-convexity linearises anew where a level ended without a step, and once at the last scale.
+        levels = max(options.max_iterations // 2, 1) + 1 if first is not None else 0
+        for _ in range(options.max_iterations + levels):
+            self._linearise()
+            self._factorise(0)
+            for level in reversed(range(self._levels)):
+                begin, end = layout.level_columns[level : level + 2]
+                self._launch("substitute", end - begin, _FACTOR_THREADS, begin)
+            self._launch("propose", 1, _WIDE_THREADS)
+        self._linearise()
+        for attempt in range(1, _COVARIANCE_ATTEMPTS + 1) if any(self._intrinsics_free) else ():
+            self._factorise(attempt)
+            self._launch("covariance", 1, 1, attempt)
+        frames, cells = self._state.inverse_depth.shape
+        self._launch("finish", -(-frames * max(cells, 16) // _WIDE_THREADS), _WIDE_THREADS)
+
+    def _reset(self) -> None:
+        """The state into both buffers, and what depends on the input only."""
+        state, priors, tensors = self._state, self._problem.priors, self._tensors
+        tensors["pose"].copy_(state.cam_from_world.flatten(1))
+        tensors["depth"].copy_(state.inverse_depth)
+        tensors["intrinsics"].zero_()
+        tensors["intrinsics"][:, : len(state.intrinsics)].copy_(state.intrinsics)
+        tensors["median"].copy_(state.inverse_depth.median())
+        checks = [tensor.isfinite().all() for tensor in (tensors["pose"], tensors["depth"], tensors["intrinsics"])]
+        if self._has_prior and priors.inverse_depth is not None and priors.inverse_depth_weight is not None:
+            weight = tensors["prior_weight"]
+            checks.append(weight.isfinite().all())
+            checks.append((tensors["prior_value"].isfinite() | (weight <= 0)).all())
+        tensors["finite"].copy_(torch.stack(checks).all())
+
+    def _linearise(self) -> None:
+        layout = self._layout
+        small = layout.num_units - layout.num_large
+        self._launch("transform", self._edge_blocks, _WIDE_THREADS)
+        if layout.num_large:
+            self._launch("tile_large", layout.num_large * self._slices, TILE_THREADS, 0, LARGE_SHARED_BYTES)
+        if small:
+            self._launch("tile", small * self._slices, TILE_THREADS, layout.num_large, layout.shared_bytes)
+        self._launch("fold", layout.num_units, _WIDE_THREADS)
+        self._launch("assemble", -(-layout.num_blocks // _ASSEMBLE_BLOCKS), _WIDE_THREADS)
+        self._launch("judge", 1, _WIDE_THREADS)
+
+    def _factorise(self, covariance: int) -> None:
+        layout = self._layout
+        self._launch("damp", layout.num_tiles, _FACTOR_THREADS, covariance)
+        for level in range(self._levels):
+            begin, end = layout.level_tiles[level : level + 2]
+            if level:
+                self._launch("gather", end - begin, _FACTOR_THREADS, covariance, second=begin)
+            self._launch("factorise", end - begin, _FACTOR_THREADS, covariance, second=begin)
+
+    @property
+    def _edge_blocks(self) -> int:
+        return -(-len(self._problem.edges.source) // _WIDE_THREADS)
+
+    def _launch(
+        self, kernel: str, blocks: int, threads: int, first: int = 0, shared_bytes: int = 0, *, second: int = 0
+    ) -> None:
+        address = self._parameters.address(first, second)
+        self._launcher.launch(kernel, blocks, threads, shared_bytes, address)
+
+    # -- answer ----------------------------------------------------------------------------------------------------
+
+    def result(self) -> Result:
+        """Wait for the last `run`, and read what came of it."""
+        report = self._tensors["report"].tolist()
+        status = _STATUS[int(report[0])]
+        if status is Status.NON_FINITE and not self._tensors["finite"].item():
+            return Result(self._state, status, 0, math.nan, math.nan, 0.0)
+        if status in (Status.NON_FINITE, Status.EMPTY):
+            return Result(self._state, status, 0, report[2], report[3], report[4])
+        tensors, given = self._tensors, self._state
+        state = State(
+            tensors["pose"][0].view_as(given.cam_from_world).clone(),
+            tensors["depth"][0].clone(),
+            tensors["intrinsics"][0, : len(given.intrinsics)].clone(),
+        )
+        a, b, c, d = report[6:10]
+        covariance: Covariance = ((a, b), (c, d))
+        if report[5]:
+            covariance = ((math.nan, math.nan), (math.nan, math.nan))
+        return Result(state, status, int(report[1]), report[2], report[3], report[4], (covariance,))
+
+
+class _Parameters:
+    """The arguments of a launch where the driver finds them: the context, and up to two numbers."""
+
+    def __init__(self, context: Context) -> None:
+        self._context = context
+        self._numbers = (ctypes.c_int * 2)()
+        start = ctypes.addressof(self._numbers)
+        self._addresses = (ctypes.c_void_p * 3)(ctypes.addressof(context), start, start + ctypes.sizeof(ctypes.c_int))
+        self._address = ctypes.addressof(self._addresses)
+
+    def address(self, first: int, second: int) -> int:
+        self._numbers[0], self._numbers[1] = first, second
+        return self._address
+
+
+def _bytes(tensor: Tensor, dtype: torch.dtype) -> bytes:
+    return tensor.detach().cpu().to(dtype).contiguous().numpy().tobytes()
+
+
+@lru_cache(maxsize=32)
+def _layout(source: bytes, target: bytes, poses: bytes, depths: bytes, cells: int, intrinsics: int) -> Layout:
+    """`build_layout`, kept for the graphs solved last: a schedule of kernels solves the same graph several times."""
+    return build_layout(
+        np.frombuffer(source, np.int64),
+        np.frombuffer(target, np.int64),
+        np.frombuffer(poses, np.bool_),
+        np.frombuffer(depths, np.bool_),
+        cells,
+        intrinsics,
+    )
