@@ -100,7 +100,8 @@ def newton_step(problem: Problem, state: State, options: Options, damping: float
         if priors.inverse_depth is not None and priors.inverse_depth_weight is not None:
             rows.append((priors.inverse_depth_weight.double().sqrt() * (depth - priors.inverse_depth)).flatten())
         if priors.log_focal is not None:
-            rows.append((params[:, 0].log() - torch.tensor(priors.log_focal, dtype=torch.float64)) / priors.log_focal_sigma)
+            log_focal = torch.tensor(priors.log_focal, dtype=torch.float64)
+            rows.append((params[:, 0].log() - log_focal) / priors.log_focal_sigma)
         if priors.cam_from_rig is not None:
             rows.append(extrinsic_residual(views, priors).flatten())
         return torch.cat(rows)

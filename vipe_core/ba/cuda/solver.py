@@ -141,7 +141,8 @@ class Adjustment:
         frames, cells = self._state.inverse_depth.shape
         focal_free, alpha_free = self._intrinsics_free
         any_depth = bool(layout.tables["unit_free"].any())
-        has_focal_prior = priors.log_focal is not None and focal_free
+        log_focal = priors.log_focal[0] if isinstance(priors.log_focal, tuple) else priors.log_focal
+        information = 1 / priors.log_focal_sigma**2 if log_focal is not None and focal_free else 0.0
         context = Context(
             num_frames=frames,
             num_edges=len(problem.edges.source),
@@ -170,8 +171,8 @@ class Adjustment:
             min_depth_ratio=options.min_depth_ratio,
             min_depth=options.min_inverse_depth,
             max_depth=options.max_inverse_depth,
-            log_focal=np.ravel(priors.log_focal)[0] if has_focal_prior else 0.0,
-            log_focal_information=1 / priors.log_focal_sigma**2 if has_focal_prior else 0.0,
+            log_focal=log_focal or 0.0,
+            log_focal_information=information,
         )
         for name, tensor in self._tensors.items():
             setattr(context, name, tensor.data_ptr())
