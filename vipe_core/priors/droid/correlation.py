@@ -17,6 +17,8 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from vipe_core.priors.droid.kernels import lookup_kernels
+
 LEVELS = 4
 RADIUS = 3
 SIDE = 2 * RADIUS + 1
@@ -62,7 +64,10 @@ class VolumeCorrelation:
 
     def lookup(self, cells: Tensor) -> Tensor:
         edges, height, width, _ = cells.shape
-        at = cells.reshape(edges, height * width, 2).float()
+        at = cells.reshape(edges, height * width, 2).float().contiguous()
+        kernels = lookup_kernels(cells.device, self.levels[0].dtype)
+        if kernels is not None:
+            return _channels_last(kernels.of_volume(self.levels, at), height, width)
         found = [windows_of_volume(level, at / 2**number) for number, level in enumerate(self.levels)]
         return _as_channels(found, height, width)
 
@@ -99,7 +104,10 @@ class FeatureCorrelation:
 
     def lookup(self, cells: Tensor) -> Tensor:
         edges, height, width, _ = cells.shape
-        at = cells.reshape(edges, height * width, 2).float()
+        at = cells.reshape(edges, height * width, 2).float().contiguous()
+        kernels = lookup_kernels(cells.device, self.frames.dtype)
+        if kernels is not None:
+            return _channels_last(kernels.of_features(self.levels, self.source, self.target, at), height, width)
         answer = torch.empty(edges, NUM_CHANNELS, height, width, dtype=torch.float32, device=cells.device)
         batch = max(1, _BATCH_VALUES // (self.frames[0].numel() * (SIDE + 1)))
         for start in range(0, edges, batch):
@@ -172,3 +180,8 @@ def _as_channels(levels: Sequence[Tensor], height: int, width: int) -> Tensor:
     """(E, 196, h, w) of the levels' (E, P, 49)."""
     together = torch.cat(tuple(levels), dim=-1)
     return together.mT.reshape(len(together), NUM_CHANNELS, height, width)
+
+
+def _channels_last(found: Tensor, height: int, width: int) -> Tensor:
+    """(E, 196, h, w) of (E, P, 196), as it lies in memory."""
+    return found.view(len(found), height, width, NUM_CHANNELS).permute(0, 3, 1, 2)
