@@ -9,6 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from vipe_core.priors.droid.encoder import Encoder
+from vipe_core.priors.droid.graphs import GraphCache
 from vipe_core.priors.droid.update import HIDDEN, Updated, UpdateOperator
 
 FEATURES = 128
@@ -35,6 +36,7 @@ class DroidNetwork(nn.Module):
         self.register_buffer("_std", torch.tensor(_STD).view(1, 3, 1, 1), persistent=False)
         self._mean: Tensor
         self._std: Tensor
+        self._graphs: GraphCache | None = None
         self.requires_grad_(False)
         self.eval()
 
@@ -64,6 +66,7 @@ class DroidNetwork(nn.Module):
             for parameter in self.parameters():
                 if parameter.ndim == 4:
                     parameter.data = parameter.data.contiguous(memory_format=torch.channels_last)
+            self._graphs = GraphCache(self._step)
         return self
 
     def normalised(self, pictures: Tensor) -> Tensor:
@@ -87,11 +90,17 @@ class DroidNetwork(nn.Module):
 
     def step(self, hidden: Tensor, context: Tensor, correlation: Tensor, motion: Tensor, share: Tensor) -> Updated:
         """One update; see `UpdateOperator`. `motion` is of any size."""
+        inputs = (hidden, context, correlation, motion, share)
+        with torch.inference_mode():
+            return Updated(*(self._step(*inputs) if self._graphs is None else self._graphs(*inputs)))
+
+    def _step(
+        self, hidden: Tensor, context: Tensor, correlation: Tensor, motion: Tensor, share: Tensor
+    ) -> tuple[Tensor, ...]:
         with self._precision():
-            updated: Updated = self.update(
-                hidden, context, correlation, motion.clamp(-_MAX_MOTION, _MAX_MOTION).to(self.dtype), share
-            )
-        return updated
+            near = motion.clamp(-_MAX_MOTION, _MAX_MOTION).to(self.dtype)
+            updated: Updated = self.update(hidden, context, correlation, near, share)
+        return updated.hidden, updated.delta, updated.weight, updated.damping
 
     @contextmanager
     def _precision(self) -> Iterator[None]:
@@ -99,5 +108,6 @@ class DroidNetwork(nn.Module):
             if self.device.type == "cpu":
                 yield
                 return
-            with torch.autocast(self.device.type, dtype=self.dtype):
+            # Weights cast once and kept would belong to the graph in which that happened.
+            with torch.autocast(self.device.type, dtype=self.dtype, cache_enabled=False):
                 yield

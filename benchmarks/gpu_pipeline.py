@@ -1,0 +1,282 @@
+"""Speed of the network's SLAM on a device: frames per second for several videos at once, stage by stage.
+
+    python -m benchmarks.gpu_pipeline [--device cuda] [--videos 1 2 4 8] [--frames N] [--size WxH] [--lean]
+
+Weights are random and seeded, so nothing that a network sees may decide anything: every n-th frame is a keyframe, none
+is dropped, and edges join each keyframe with the three before it. The counts are printed. Each video has a process of
+its own, as in the service; the clock runs from when all of them are ready to when the last is done. Without --device
+the first GPU is taken; on a machine without one, a tiny clip on the CPU shows that the command works, and says so.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import multiprocessing
+import sys
+import tempfile
+import time
+from collections.abc import Sequence
+from contextlib import closing
+from dataclasses import dataclass, replace
+from multiprocessing.synchronize import Barrier
+from pathlib import Path
+from queue import Queue
+from typing import Any
+
+import numpy as np
+import torch
+from rich.console import Console
+from rich.table import Table
+
+from vipe_core.cameras import Camera
+from vipe_core.pipeline.device import resolve_device, set_threads
+from vipe_core.pipeline.presets import resolve
+from vipe_core.priors.droid import DroidMatcher, DroidNetwork
+from vipe_core.priors.droid.memory import plan_memory
+from vipe_core.slam.adjustment import Adjuster, FocalPrior
+from vipe_core.slam.frames import EncodedFrames
+from vipe_core.slam.graph import Graph
+from vipe_core.slam.keyframes import KeyframeMap
+from vipe_core.slam.recurrent.backend import RefinedBackend
+from vipe_core.slam.recurrent.posing import FramePoser, Unposed
+from vipe_core.slam.recurrent.tracking import RefinedTracker
+from vipe_core.slam.reprojection import Reprojector
+from vipe_core.slam.selection import Keyframe
+from vipe_core.slam.settings import SlamSettings
+from vipe_core.slam.timing import StageClock
+from vipe_core.slam.working import working_size
+from vipe_core.video import open_source
+from vipe_core.video.encode import VideoWriter
+
+_SEED = 1
+_FPS = 30.0
+_PATIENCE_S = 3600.0
+
+
+@dataclass(frozen=True, slots=True)
+class Workload:
+    """What every video is.
+
+    Attributes:
+        video: The clip.
+        every: Every so many-th frame is a keyframe.
+        device: Where networks and bundle adjustment run.
+        settings: Of the SLAM stage, with a schedule that nothing of the picture decides.
+    """
+
+    video: Path
+    every: int
+    device: str
+    settings: SlamSettings
+
+
+@dataclass(frozen=True, slots=True)
+class Run:
+    """One video's part: frames, keyframes, edges of the global graph, seconds by stage, most bytes on the GPU."""
+
+    frames: int
+    keyframes: int
+    edges: int
+    seconds: dict[str, float]
+    peak_bytes: int
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
+    parser.add_argument("--device", help="cuda, cuda:N or cpu")
+    parser.add_argument("--videos", type=int, nargs="+", help="how many at once, one run for each")
+    parser.add_argument("--frames", type=int, help="of each video")
+    parser.add_argument("--size", help="of the video, WIDTHxHEIGHT")
+    parser.add_argument("--every", type=int, help="every n-th frame is a keyframe")
+    parser.add_argument("--lean", action="store_true", help="no volumes of correlation: the profile for small GPUs")
+    arguments = parser.parse_args(argv)
+    device = resolve_device(arguments.device or ("cuda" if torch.cuda.is_available() else "cpu"))
+    on_gpu = device.type == "cuda"
+    width, height = (int(side) for side in (arguments.size or ("640x480" if on_gpu else "64x48")).split("x"))
+    frames = arguments.frames or (300 if on_gpu else 12)
+    every = arguments.every or (6 if on_gpu else 1)
+    counts = arguments.videos or ([1, 2, 4, 8] if on_gpu else [1, 2])
+    settings = _settings(lean=arguments.lean, short=not on_gpu)
+
+    console = Console(width=120)
+    if not on_gpu:
+        console.print("No GPU: a tiny clip with a short schedule on the CPU. Its figures say nothing about speed.")
+    console.print(f"device: {torch.cuda.get_device_name(device) if on_gpu else 'cpu'}, torch {torch.__version__}")
+    _print_plan(console, settings, width, height, frames // every + 1, device)
+    with tempfile.TemporaryDirectory(prefix="vipe-gpu-") as folder:
+        video = _clip(Path(folder) / "clip.mp4", frames, width, height)
+        workload = Workload(video, every, str(device), settings)
+        table = Table(title=f"{frames} frames of {width}x{height}, random weights, a fixed schedule")
+        for heading in ("videos at once", "frames/s", "wall s", "GB at most", "keyframes", "edges", "seconds by stage"):
+            table.add_column(heading, justify="left" if heading == "seconds by stage" else "right")
+        for count in counts:
+            wall_s, runs = _at_once(workload, count)
+            stages = ", ".join(
+                f"{stage} {np.mean([run.seconds[stage] for run in runs]):.2f}" for stage in runs[0].seconds
+            )
+            table.add_row(
+                str(count),
+                f"{sum(run.frames for run in runs) / wall_s:.2f}",
+                f"{wall_s:.2f}",
+                f"{max(run.peak_bytes for run in runs) / 1e9:.2f}" if on_gpu else "-",
+                str(runs[0].keyframes),
+                str(runs[0].edges),
+                stages,
+            )
+        console.print(table)
+    return 0
+
+
+def _settings(*, lean: bool, short: bool) -> SlamSettings:
+    slam = resolve("pose_only").slam
+    schedule = replace(slam.refinement, redundant_px=0.0, window_px=0.0, global_px=0.0, lean=lean)
+    if short:
+        schedule = replace(
+            schedule, first_updates=2, updates=1, more_updates=1, global_updates=(1, 1, 2), fill_updates=2
+        )
+    return replace(slam, refinement=schedule)
+
+
+def _at_once(workload: Workload, count: int) -> tuple[float, list[Run]]:
+    """Seconds from when all videos are ready to when the last is done, and each one's part."""
+    context = multiprocessing.get_context("spawn")
+    ready, answers = context.Barrier(count + 1), context.Queue()
+    workers = [context.Process(target=_worker, args=(workload, ready, answers)) for _ in range(count)]
+    for worker in workers:
+        worker.start()
+    try:
+        ready.wait(_PATIENCE_S)
+        start_s = time.perf_counter()
+        runs: list[Run] = [answers.get(timeout=_PATIENCE_S) for _ in workers]
+        wall_s = time.perf_counter() - start_s
+    finally:
+        for worker in workers:
+            worker.join(1.0)
+            worker.terminate()
+    return wall_s, runs
+
+
+def _worker(workload: Workload, ready: Barrier, answers: Queue[Run]) -> None:
+    set_threads(1)
+    device = resolve_device(workload.device)
+    network = DroidNetwork.random(_SEED).ready(device)
+    _annotate(workload, network, frames=2 * workload.every + 1)  # kernels are compiled and memory is there
+    ready.wait(_PATIENCE_S)
+    answers.put(_annotate(workload, network))
+
+
+def _annotate(workload: Workload, network: DroidNetwork, frames: int | None = None) -> Run:
+    """One video with the pieces that the engine is made of, and a schedule in the place of its decisions."""
+    settings, device = workload.settings, network.device
+    schedule = settings.refinement
+    clock = _SyncedClock(device)
+    if device.type == "cuda":
+        torch.cuda.reset_peak_memory_stats(device)
+    source = open_source(workload.video)
+    matcher = DroidMatcher(network)
+    info = source.info
+    size = working_size(info.width, info.height, settings.working_area_px, offset_px=matcher.offset_px)
+    encoded = EncodedFrames(source, size, matcher, settings.frame_cache_bytes)
+    keyframes: list[Keyframe] = []
+    with clock("decode and encode"), closing(encoded.first_pass()) as stream:
+        for work, features in stream:
+            if work.index % workload.every == 0:
+                keyframes.append(Keyframe(work.index, features))
+            if frames is not None and work.index + 1 == frames:
+                break
+    count = len(encoded)
+    camera = Camera.pinhole_from_fov(60.0, size.width, size.height)
+    reprojector = Reprojector("pinhole", size.grid)
+    built = KeyframeMap(size.grid, "pinhole", camera.index_params())
+    scale_px = settings.scaled_px(1.0, size.width)
+    adjuster = Adjuster(settings, device, FocalPrior(math.log(camera.focal_px), 0.1), scale_px)
+    tracker = RefinedTracker(matcher, built, adjuster, reprojector, schedule, scale_px)
+    graph = Graph()
+    backend = RefinedBackend(matcher, built, graph, adjuster, reprojector, schedule, scale_px)
+    with torch.inference_mode():
+        with clock("track"):
+            first = min(settings.min_keyframes, len(keyframes))
+            tracker.start(keyframes[:first], [one.index / _FPS for one in keyframes[:first]])
+            for keyframe in keyframes[first:]:
+                tracker.add(keyframe, keyframe.index / _FPS)
+        with clock("backend"):
+            for updates in schedule.global_updates[1:]:
+                backend.run(updates)
+        with clock("infill"):
+            usable = np.ones((len(built), size.grid.num_cells), np.bool_)
+            poser = FramePoser(matcher, built, adjuster, usable, schedule)
+            waiting: list[Unposed] = []
+            with closing(encoded.again(0, count)) as stream:
+                for index, features in stream:
+                    before = min(index // workload.every, len(built) - 2)
+                    if index % workload.every:
+                        waiting.append(Unposed(features, built.pose(before), (before, before + 1)))
+                    if len(waiting) == settings.infill_batch or (waiting and index == count - 1):
+                        poser.run(waiting)
+                        waiting = []
+    peak_bytes = torch.cuda.max_memory_allocated(device) if device.type == "cuda" else 0
+    return Run(count, len(built), len(graph), clock.seconds, peak_bytes)
+
+
+class _SyncedClock(StageClock):
+    """Waits for the device at the end of each stage, so that its work counts where it was asked for."""
+
+    def __init__(self, device: torch.device) -> None:
+        super().__init__()
+        self._device = device
+
+    def __call__(self, stage: str) -> Any:
+        return _Synced(super().__call__(stage), self._device)
+
+
+class _Synced:
+    def __init__(self, stage: Any, device: torch.device) -> None:
+        self._stage, self._device = stage, device
+
+    def __enter__(self) -> None:
+        self._stage.__enter__()
+
+    def __exit__(self, *error: Any) -> Any:
+        if self._device.type == "cuda":
+            torch.cuda.synchronize(self._device)
+        return self._stage.__exit__(*error)
+
+
+def _clip(path: Path, frames: int, width: int, height: int) -> Path:
+    """A smooth random picture that the camera pans over."""
+    rng = np.random.default_rng(_SEED)
+    coarse = torch.from_numpy(rng.uniform(0, 255, (1, 3, height // 8 + 2, width // 8 + frames // 4 + 2)))
+    wide = torch.nn.functional.interpolate(coarse, scale_factor=8, mode="bicubic")[0].clamp(0, 255)
+    picture = wide.permute(1, 2, 0).numpy().astype(np.uint8)
+    with VideoWriter(path, _FPS) as writer:
+        for index in range(frames):
+            writer.write(np.ascontiguousarray(picture[:height, 2 * index : 2 * index + width]))
+    return path
+
+
+def _print_plan(
+    console: Console, settings: SlamSettings, width: int, height: int, keyframes: int, device: torch.device
+) -> None:
+    grid = working_size(width, height, settings.working_area_px).grid
+    schedule = settings.refinement
+    for lean in (False, True):
+        plan = plan_memory(
+            grid,
+            keyframes=keyframes,
+            window_edges=schedule.window_edges,
+            edges_per_keyframe=schedule.global_edges,
+            fill_frames=settings.infill_batch,
+            cache_bytes=settings.frame_cache_bytes,
+            lean=lean,
+        )
+        room = ""
+        if device.type == "cuda":
+            total_bytes = torch.cuda.get_device_properties(device).total_memory
+            room = f"; {plan.slots(total_bytes)} at once on this GPU"
+        profile = "without volumes" if lean else "with volumes"
+        console.print(f"planned {profile}: {plan.total_bytes / 1e9:.2f} GB a video, {keyframes} keyframes{room}")
+
+
+if __name__ == "__main__":
+    sys.exit(main())
