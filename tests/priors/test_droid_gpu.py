@@ -1,4 +1,4 @@
-"""The DROID network on a GPU against itself on a CPU, and with its graphs and kernels against without; memory planned."""
+"""The DROID network on a GPU against itself on a CPU, with its graphs and kernels against without; planned memory."""
 
 from __future__ import annotations
 
@@ -101,7 +101,7 @@ def test_memory_is_planned_from_sizes_and_volumes_give_way_on_small_devices() ->
     assert few.work_bytes == many.work_bytes
     # 25 MB of volumes an edge at 512 x 384.
     assert few.work_bytes > 2 * 48 * 25e6
-    assert few_lean.work_bytes < 48 * 25e6
+    assert few_lean.work_bytes < few.work_bytes - 48 * 12e6
     assert few.slots(80 << 30) > few.slots(24 << 30) >= 1
     assert many_lean.slots(1 << 30) == 0
     assert volumes_fit(grid, 48, 16 << 30)

@@ -12,7 +12,6 @@ from torch import Tensor
 logger = logging.getLogger(__name__)
 
 _MOST_GRAPHS = 16
-_WARM_UPS = 3
 
 Key = tuple[tuple[torch.Size, tuple[int, ...], torch.dtype], ...]
 
@@ -22,13 +21,7 @@ class _Captured:
 
     def __init__(self, run: Callable[..., tuple[Tensor, ...]], inputs: tuple[Tensor, ...]) -> None:
         self._inputs = tuple(given.clone(memory_format=torch.preserve_format) for given in inputs)
-        before = torch.cuda.current_stream()
-        aside = torch.cuda.Stream()
-        aside.wait_stream(before)
-        with torch.cuda.stream(aside):
-            for _ in range(_WARM_UPS):
-                run(*self._inputs)
-        before.wait_stream(aside)
+        run(*self._inputs)  # whatever libraries allocate at first must not be allocated by the graph
         self._graph = torch.cuda.CUDAGraph()
         with torch.cuda.graph(self._graph):
             self._outputs = run(*self._inputs)
