@@ -171,9 +171,13 @@ class KeyframeMap:
         median = float(np.median(self.depths()))
         if not np.isfinite(median) or median <= 0:
             return
+        self.rescale(median)
+
+    def rescale(self, factor: float) -> None:
+        """Make all lengths so many times larger."""
         for k in range(len(self)):
-            self._depths[k] = (self._depths[k] / median).astype(np.float32)
-            self._poses[k][:3, 3] *= median
+            self._depths[k] = (self._depths[k] / factor).astype(np.float32)
+            self._poses[k][:3, 3] *= factor
         if self.cam_from_rig is not None:
-            self.cam_from_rig[:, :3, 3] *= median
-            self.rig_units /= median
+            self.cam_from_rig[:, :3, 3] *= factor
+            self.rig_units /= factor

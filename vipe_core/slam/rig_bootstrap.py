@@ -87,25 +87,38 @@ class RigBootstrap:
             self._keyframes.set_rig_pose(instant, np.eye(4))
         self._take_cameras(starts)
         self._connect_at_infinity()
+        free = self._adjuster.extrinsic_prior is not None
+        # The scale that wrong extrinsics seem to tell is looked for again with the refined ones.
+        for last in (False, True) if free else (True,):
+            self._place_best(starts)
+            self._take_depths()
+            self._keyframes.normalise_scale()
+            everything = range(len(self._keyframes))
+            self._masks.update(everything)
+            self._adjust(free_extrinsics=free)
+            CrossViews(self._measured, self._reprojector).connect(everything)
+            self._masks.update(everything)
+            self._adjust(free_extrinsics=free)
+            self._keyframes.normalise_scale()
+            if not last:
+                self._keyframes.rescale(self._keyframes.rig_units)
+
+    def _adjust(self, *, free_extrinsics: bool) -> None:
+        everything = range(len(self._keyframes))
+        self._adjuster.adjust(
+            self._keyframes, self._graph, everything, (0,), REFINE, free_extrinsics=free_extrinsics
+        )
+
+    def _place_best(self, starts: Sequence[_ViewStart]) -> None:
+        """Place all by the view and the scale that make the measurements of all views agree best."""
         best: tuple[float, _ViewStart, float] | None = None
         for start in sorted(starts, key=lambda one: one.cost)[:_MAX_BASES]:
             cost, unit = self._search(start)
-            logger.debug(
-                "view %d alone: cost %.4f; as a rig, at %.4g to a unit: %.4f", start.view, start.cost, unit, cost
-            )
+            logger.debug("view %d: cost %.4f; the rig at %.4g to a unit: %.4f", start.view, start.cost, unit, cost)
             if best is None or cost < best[0]:
                 best = cost, start, unit
         assert best is not None
         self._place(best[1], best[2])
-        self._take_depths()
-        self._keyframes.normalise_scale()
-        everything = range(len(self._keyframes))
-        self._masks.update(everything)
-        self._adjuster.adjust(self._keyframes, self._graph, everything, (0,), REFINE)
-        CrossViews(self._measured, self._reprojector).connect(everything)
-        self._masks.update(everything)
-        self._adjuster.adjust(self._keyframes, self._graph, everything, (0,), REFINE)
-        self._keyframes.normalise_scale()
 
     def _alone(self, view: int, first: Sequence[Keyframe], times_s: Sequence[float]) -> _ViewStart:
         """Start one view by itself, and file what it measured."""
