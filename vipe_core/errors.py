@@ -10,6 +10,7 @@
     │   ├── MediaTooLarge         media_too_large
     │   ├── MaskMismatch          mask_mismatch       given masks do not belong to the pictures
     │   ├── CalibrationMismatch   calibration_mismatch  the given calibration is not of the pictures
+    │   ├── ViewsNotSynchronised  views_not_synchronised  the videos of a rig do not show the same instants
     │   └── ScaleUnobservable     scale_unobservable  the known length cannot be found in the video
     ├── DecodeError           the decoder child is the cause
     │   ├── DecodeTimeout         decode_timeout      (retryable)
@@ -97,6 +98,12 @@ class CalibrationMismatch(InputError):
     """A calibration was given that cannot be of pictures of this size."""
 
     code = "calibration_mismatch"
+
+
+class ViewsNotSynchronised(InputError):
+    """Videos of a rig that differ in length, in rate, or in the times of their frames."""
+
+    code = "views_not_synchronised"
 
 
 class ScaleUnobservable(InputError):

@@ -16,13 +16,18 @@ if TYPE_CHECKING:
 
 
 def annotate(
-    inputs: Annotated[list[Path], typer.Argument(metavar="INPUT...", help="Video files, or directories of images.")],
     output: Annotated[
         Path,
         typer.Option(
             "-o", "--output", metavar="OUT", help="Gets pose/, intrinsics/, depth/, rgb/, mask/, confidence/."
         ),
     ],
+    inputs: Annotated[
+        list[Path] | None,
+        typer.Argument(
+            metavar="INPUT...", help="Video files, or directories of images. With --rig, one per view, in their order."
+        ),
+    ] = None,
     preset: Annotated[
         str,
         typer.Option(
@@ -46,6 +51,14 @@ def annotate(
             "camera above the ground, or depth=METRES@X,Y,FRAME from the camera to what a pixel of a frame shows.",
         ),
     ] = None,
+    rig: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="RIG.json",
+            help="The inputs are the synchronised views of one rig (docs/rigs.md); without inputs, those that the file "
+            "names. Writes one sequence per view, and the rig as it was found.",
+        ),
+    ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="One JSON line per input on stdout, nothing else.")] = False,
 ) -> None:
     """Annotate videos on this machine, without the service.
@@ -61,8 +74,13 @@ def annotate(
     from vipe_core.pipeline.annotator import Annotator
     from vipe_core.video.limits import use_limits
 
-    if masks is not None and len(inputs) > 1:
-        raise typer.BadParameter(f"the masks are of one input, not of {len(inputs)}", param_hint="--masks")
+    paths = list(inputs or [])
+    if not paths and rig is None:
+        raise typer.BadParameter("give at least one input, or a rig that names its videos", param_hint="INPUT")
+    if rig is not None and masks is not None:
+        raise typer.BadParameter("the views of a rig take no masks", param_hint="--masks")
+    if masks is not None and len(paths) > 1:
+        raise typer.BadParameter(f"the masks are of one input, not of {len(paths)}", param_hint="--masks")
     if scale_from is not None:
         try:
             KnownLength.parse(scale_from)
@@ -70,10 +88,20 @@ def annotate(
             raise typer.BadParameter(str(error), param_hint="--scale-from") from error
     use_limits(read_settings().media_limits())
     console = Console(stderr=True, quiet=as_json)
+    if rig is not None:
+        from services.cli.annotate_rig import annotate_rig
+
+        engine = {"preset": preset, "camera": camera, "device": device}
+        views = annotate_rig(rig, paths, output, scale_from, engine, console)
+        if as_json:
+            for row in views:
+                _print_json(row)
+        _show(views, output, as_json=as_json)
+        return
     annotator = Annotator(preset=preset, camera=camera, device=device)
     names = SequenceNames(output)
     rows: list[dict[str, Any]] = []
-    for path in inputs:
+    for path in paths:
         started = time.perf_counter()
         try:
             row = _annotate_one(annotator, path, output, names.name_for(path), masks, scale_from, console)
@@ -84,8 +112,17 @@ def annotate(
             console.print(f"[red]{path}: {error} \\[{error.code}]", highlight=False)
         rows.append(row)
         if as_json:
-            sys.stdout.write(json.dumps(row) + "\n")
-            sys.stdout.flush()
+            _print_json(row)
+    _show(rows, output, as_json=as_json)
+
+
+def _print_json(row: dict[str, Any]) -> None:
+    sys.stdout.write(json.dumps(row) + "\n")
+    sys.stdout.flush()
+
+
+def _show(rows: list[dict[str, Any]], output: Path, *, as_json: bool) -> None:
+    """A table of what was done; exit code 1 if anything failed."""
     done = [row for row in rows if "error" not in row]
     if done and not as_json:
         from services.cli.tables import annotation_table, results_console
@@ -129,10 +166,10 @@ def _annotate_one(
             bars.update(task, description="depth", completed=done, total=total)
 
         write_artifacts(annotation, output, progress=written)
-    return _row(path, annotation, output)
+    return annotation_row(path, annotation, output)
 
 
-def _row(path: Path, annotation: Annotation, output: Path) -> dict[str, Any]:
+def annotation_row(path: Path, annotation: Annotation, output: Path) -> dict[str, Any]:
     return {
         "input": str(path),
         "name": annotation.name,

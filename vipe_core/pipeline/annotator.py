@@ -97,10 +97,10 @@ class Annotator:
         source = open_source(video, name=name) if isinstance(video, (str, Path)) else video
         if masks is not None:
             source = MaskedView(source, masks)
-        report = _Reporter(progress)
+        report = Reporter(progress)
 
         slam = Slam(self._priors(), self.preset.slam, self.device)
-        with _typed_errors(source, report), torch.inference_mode():
+        with typed_errors(source, report), torch.inference_mode():
             result = slam.run(source, report)
             quality = assess(result, self.preset.slam, source.info.width)
             scaled = set_scale(scene_of(result), source, known, self._depth.metric, report)
@@ -157,17 +157,17 @@ class Annotator:
         source: FrameSource,
         scaled: ScaledScene,
         timings: dict[str, float],
-        report: _Reporter,
+        report: Reporter,
     ) -> Generator[DenseFrame, None, None]:
         """Depth and mask of every frame in order; the time spent here, not in the consumer, is added to `timings`."""
         total = len(scaled.scene.world_from_cam)
         spent_s = 0.0
-        with _typed_errors(source, report):
+        with typed_errors(source, report):
             stream = self._depth_stage(scaled).stream(source, scaled.scene)
         with closing(stream) as frames:
             while True:
                 start_s = time.perf_counter()
-                with _typed_errors(source, report):
+                with typed_errors(source, report):
                     frame = next(frames, None)
                 spent_s += time.perf_counter() - start_s
                 timings["depth"] = spent_s
@@ -186,7 +186,7 @@ class Annotator:
         return AlignedDepth(self._depth, self.preset.alignment, metres=scaled.scale == "metric")
 
 
-class _Reporter:
+class Reporter:
     """Passes progress on, and remembers what the callback raised: that is the caller's and goes back as it is."""
 
     def __init__(self, callback: ProgressCallback | None) -> None:
@@ -204,7 +204,7 @@ class _Reporter:
 
 
 @contextmanager
-def _typed_errors(source: FrameSource, report: _Reporter) -> Iterator[None]:
+def typed_errors(source: FrameSource, report: Reporter) -> Iterator[None]:
     """Turns what a library threw into an EngineError; what memory, disks and the caller raise goes through."""
     try:
         yield

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import dataclasses
+from collections.abc import Callable, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 
@@ -30,6 +31,8 @@ from vipe_core.video.source import FrameSource
 
 # Pictures of a shot that are given to metric depth: their errors are far from independent, so more say little more.
 _MAX_PICTURES = 32
+# The size of a rig tells metres only where the map is that sure of it.
+_SURE_OF_SIZE = 0.2
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,13 +42,28 @@ class ScaledScene:
     Attributes:
         scene: In metres, or normalised.
         scale: Which of them.
-        source: What the scale was taken from: `normalised`, `metric_depth`, or the known length as text.
+        source: What the scale was taken from: `normalised`, `metric_depth`, `rig`, or the known length as text.
         sigma_ratio: Standard deviation of the logarithm of the scale, of the worst shot; NaN for `normalised`.
     """
 
     scene: SceneMap
     scale: Scale
     source: str
+    sigma_ratio: float
+
+
+@dataclass(frozen=True, slots=True)
+class RigSize:
+    """What the extrinsics of a rig say of the scale.
+
+    Attributes:
+        metric: They are metres.
+        units: Length of the map's unit in theirs.
+        sigma_ratio: Standard deviation of the logarithm of that; infinite where the size of the rig is not seen.
+    """
+
+    metric: bool
+    units: float
     sigma_ratio: float
 
 
@@ -77,6 +95,48 @@ def set_scale(
         return ScaledScene(scene, "relative", "normalised", float("nan"))
     scaled = rescaled(scene, [estimate.metres_per_unit for estimate in estimates])
     return ScaledScene(scaled, "metric", name, max(estimate.sigma_ratio for estimate in estimates))
+
+
+def set_rig_scale(
+    scenes: Sequence[SceneMap],
+    source: FrameSource,
+    known: KnownLength | None,
+    metric: MetricDepth | None,
+    size: RigSize,
+    report: Callable[[str, int, int | None], None],
+) -> tuple[list[ScaledScene], float]:
+    """The maps of the views of a rig, brought to one scale.
+
+    It is that of what the user knows of the first view, else of the size of the rig where that is known and seen, else
+    of metric depth, else of the first view's normalisation.
+
+    Args:
+        scenes: All in one world and one unit.
+        source: The first view.
+
+    Returns:
+        The maps, and by how much their lengths were multiplied.
+
+    Raises:
+        ScaleUnobservable: The known length is not to be found in the first view.
+        InputError, DecodeError: From the source, which is read for metric depth.
+    """
+    if known is None and size.metric and size.sigma_ratio <= _SURE_OF_SIZE:
+        first = ScaledScene(scenes[0], "metric", "rig", size.sigma_ratio)
+        factor = size.units
+    else:
+        first = set_scale(scenes[0], source, known, metric, report)
+        seen = scenes[0].inverse_depth > 0
+        before, after = scenes[0].inverse_depth[seen], first.scene.inverse_depth[seen]
+        factor = float(np.median(before) / np.median(after)) if len(before) else 1.0
+    scaled = []
+    for scene in scenes:
+        world_from_cam = scene.world_from_cam.copy()
+        world_from_cam[:, :3, 3] *= factor
+        inverse_depth = (scene.inverse_depth / np.float32(factor)).astype(np.float32)
+        moved = dataclasses.replace(scene, world_from_cam=world_from_cam, inverse_depth=inverse_depth)
+        scaled.append(dataclasses.replace(first, scene=moved))
+    return scaled, factor
 
 
 def _from_known(scene: SceneMap, source: FrameSource, known: KnownLength) -> list[ScaleEstimate]:

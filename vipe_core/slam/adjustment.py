@@ -72,6 +72,9 @@ SETTLE = (Step("geman_mcclure", 1.0, 15, 1e-4, measured_scale=True),)
 """Everything is in its place but for the last digit."""
 
 
+_ARRIVE = Step("geman_mcclure", 1.0, 30, 1e-5, measured_scale=True)
+
+
 @dataclass(frozen=True, slots=True)
 class FocalPrior:
     """What the initialisation knows of the focal length: log(fx) at the working size and its standard deviation.
@@ -162,6 +165,8 @@ class Adjuster:
         )
         if free_extrinsics:
             problem = self._with_free_extrinsics(problem, keyframes)
+            # Extrinsics hang on little differences of much: they are the last to arrive.
+            schedule = (*schedule, _ARRIVE)
         result = self.anneal(problem, state, schedule)
         if result is None:
             return None
