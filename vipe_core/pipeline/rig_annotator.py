@@ -22,7 +22,6 @@ from vipe_core.errors import ConfigError
 from vipe_core.geometry.arrays import inverse
 from vipe_core.pipeline.annotator import Annotator, Reporter, typed_errors
 from vipe_core.pipeline.scaling import RigSize, ScaledScene, set_rig_scale
-from vipe_core.priors.classical import classical_priors
 from vipe_core.quality import assess
 from vipe_core.slam.rig_system import RigCameras, RigSlam, RigSlamResult
 from vipe_core.slam.system import SlamResult
@@ -72,10 +71,13 @@ class RigAnnotator(Annotator):
 
         Raises:
             InputError, DecodeError: A video cannot be read, or the videos do not belong together.
-            ConfigError: The rig file is not understood, or names no videos.
+            ConfigError: The rig file is not understood, or names no videos; the preset does not annotate rigs.
             ScaleUnobservable: The video does not show the known length.
             EngineError: A stage failed, a defect of ours.
         """
+        priors = self._priors()
+        if priors.refiner is not None:
+            raise ConfigError(f"the preset {self.preset.name} does not annotate rigs; classical and wide_angle do")
         known_length = None if scale_from is None else KnownLength.parse(scale_from)
         beside = Path(rig).parent if isinstance(rig, (str, Path)) else None
         known = rig if isinstance(rig, Rig) else read_rig(rig)
@@ -88,7 +90,7 @@ class RigAnnotator(Annotator):
         report = Reporter(progress)
         given = [_given(view, one) for view, one in zip(known.views, opened, strict=True)]
         with typed_errors(opened[0], report), torch.inference_mode():
-            slam = RigSlam(classical_priors(self.preset.camera), self.preset.slam, self.device)
+            slam = RigSlam(priors, self.preset.slam, self.device)
             result = slam.run(source, _cameras(known, given), report)
             size = RigSize(known.metric, result.rig_units, result.scale_sigma_ratio)
             scenes = [scene_of(view) for view in result.views]
