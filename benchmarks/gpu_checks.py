@@ -25,6 +25,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import torch
 from rich.console import Console
@@ -105,11 +106,11 @@ def _shapes() -> list[tuple[Problem, State, RobustKernel]]:
 
 
 def _same(first: Result, second: Result) -> bool:
-    states = zip(*(vars_of(result.state) for result in (first, second)), strict=True)
+    states = zip(*(_tensors(result.state) for result in (first, second)), strict=True)
     return all(torch.equal(a, b) for a, b in states) and replace(first, state=second.state) == second
 
 
-def vars_of(state: State) -> tuple[torch.Tensor, ...]:
+def _tensors(state: State) -> tuple[torch.Tensor, ...]:
     return state.cam_from_world, state.inverse_depth, state.intrinsics
 
 
@@ -154,7 +155,8 @@ def check_same_bits() -> str:
     problem, state = problem_of(Size(25, 200, focal=True), _device())
     options = Options(max_iterations=5, relative_tolerance=0.0)
     expected = _kernels(problem, state, options)
-    busy, matrix = torch.cuda.Stream(), torch.rand(2048, 2048, device=_device())
+    new_stream: Any = torch.cuda.Stream  # without types
+    busy, matrix = new_stream(), torch.rand(2048, 2048, device=_device())
     for _ in range(_RUNS):
         with torch.cuda.stream(busy):
             for _ in range(4):

@@ -83,11 +83,12 @@ def load(folder: Path) -> dict[str, Any]:
             package = ModuleType(name)
             package.__path__ = [str(folder / name.replace(".", "/"))]
             sys.modules[name] = package
-        for name, members in {
+        stand_ins: dict[str, dict[str, Any]] = {
             "lietorch": {"SE3": _Transform, "Sim3": type("Sim3", (), {})},
             "scatter": {"scatter_add": _scatter_add},
             "slam_ext": {},
-        }.items():
+        }
+        for name, members in stand_ins.items():
             module = ModuleType(f"vipe.ext.{name}")
             vars(module).update(members)
             sys.modules[module.__name__] = module
