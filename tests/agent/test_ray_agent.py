@@ -28,7 +28,8 @@ from services.observability.metrics import Metrics
 from services.storage import open_store
 from services.store.sql import SqlStore
 
-pytestmark = pytest.mark.slow
+# A worker of Ray's takes seconds to start on an idle machine, half a minute on one that is busy; some tests need five.
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(600)]
 
 HERE = Path(__file__).parent
 
@@ -70,7 +71,7 @@ def _submit(store: SqlStore, root: Path, *shards: dict[str, str]) -> str:
     return job_id
 
 
-def _finished(store: SqlStore, job_id: str, seconds: float = 120.0) -> Job:
+def _finished(store: SqlStore, job_id: str, seconds: float = 400.0) -> Job:
     _wait(lambda: store.get_job(job_id).state.terminal, f"{job_id} to end", seconds)
     return store.get_job(job_id)
 

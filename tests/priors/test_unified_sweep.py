@@ -45,7 +45,7 @@ def pairs_of(truth: Camera, *, travel: float = 0.4, noise_px: float = 0.2, count
     return pairs
 
 
-@pytest.mark.parametrize(("fov_deg", "alpha"), [(60, 0.0), (118, 0.66), (150, 0.9), (185, 1.0)])
+@pytest.mark.parametrize(("fov_deg", "alpha"), [(60, 0.0), (118, 0.66), (185, 1.0)])
 def test_the_sweep_finds_field_of_view_and_bend(fov_deg: float, alpha: float) -> None:
     found = sweep(pairs_of(camera(fov_deg, alpha)), WIDTH, HEIGHT)
     assert found is not None

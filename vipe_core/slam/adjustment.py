@@ -112,7 +112,8 @@ class Adjuster:
         extrinsic_prior: Holds the extrinsics of a rig softly; None where they are not refined.
 
     Attributes:
-        alive: Called before every solve: a sign of life for a supervisor. What it raises ends the adjustment.
+        alive: Called before every solve, and between the measurements of a global adjustment: a sign of life for a
+            supervisor. What it raises ends the adjustment.
     """
 
     def __init__(

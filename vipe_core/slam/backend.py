@@ -98,6 +98,7 @@ class Backend:
         for wide in (False, True):
             edges = sorted({*self._measured.graph, *(self._wide_edges() if wide else ())})
             for i, j in edges:
+                self._adjuster.alive()
                 self._measured.sharpen(i, j, self._settings.min_consistent, every=1 if wide else _READYING)
             result = self._adjust(SETTLE)
         self._keyframes.normalise_scale()
@@ -183,6 +184,7 @@ class Backend:
         near = self._settings.neighbours + 1
         existing = sum(1 for i, j in self._measured.graph if instant(i) - instant(j) > near)
         for pair in loop_edges(pairs, self._measured.graph, limit - existing, num_views=self._keyframes.num_views):
+            self._adjuster.alive()
             self._measured.connect(pair.target, pair.source, guided=True, min_consistent=self._settings.min_consistent)
 
     def _adjust(self, schedule: Sequence[Step] = REFINE) -> Result | None:

@@ -84,6 +84,7 @@ class LoopCloser:
         for old, new in self._candidates():
             if tried == _MAX_CLOSURES:
                 break
+            self._adjuster.alive()
             if self._hops(self._keyframes.instant(old), _NEAR_HOPS)[self._keyframes.instant(new)] <= _NEAR_HOPS:
                 continue
             if self._measured.connect_by_points(old, new, _MIN_CONSISTENT) < _MIN_CONSISTENT:

@@ -6,6 +6,7 @@ import logging
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Literal
 
 import numpy as np
@@ -118,7 +119,7 @@ class ShotMapper:
         Args:
             intrinsics: (K,) index parameters to start from.
             tracked: Told the frame up to which the shot is tracked.
-            adjusting: Called before the final global adjustment and before each of its solves.
+            adjusting: Called again and again while the final global adjustment goes on.
         """
         settings, size, reprojector = self._settings, self._size, self.reprojector
         scale_px = settings.scaled_px(1.0, size.width)
@@ -181,18 +182,19 @@ class ShotMapper:
             for done in range(first, len(chosen) + 1):
                 if done > first:
                     tracker.add(chosen[done - 1], times_s[done - 1])
+                adjuster.alive = partial(tracked, chosen[done - 1].index + 1)
                 if settings.backend_due(done) and done < len(chosen):
                     backend.run()
-                tracked(chosen[done - 1].index + 1)
+                adjuster.alive()
         before = keyframes.snapshot()
         with self._clock("backend"):
             adjuster.alive = adjusting
             adjusting()
             backend.run()
-            adjuster.alive = _nothing
             loops = examine_loops(reprojector, keyframes, graph, before, settings.neighbours)
             backend.recentre()
             backend.sharpen()
+            adjuster.alive = _nothing
         return backend.focal_sigma_ratio, loops
 
     def _refined(
