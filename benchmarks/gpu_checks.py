@@ -7,7 +7,8 @@
     one wait    a solve makes the host wait for the GPU once, at its end
     memcheck, racecheck, initcheck   compute-sanitizer on small solves, where it is installed
     ba          `python -m benchmarks.ba`
-    pipeline    `python -m benchmarks.gpu_pipeline`, where it is there
+    network     the DROID network against itself on the CPU; its kernels and graphs against their absence
+    pipeline    `python -m benchmarks.gpu_pipeline`, with short clips
 
 Every section runs in a process of its own under a time limit and survives the failure of another. Without a GPU it says
 so and does nothing. `--vipe FOLDER` is handed to `benchmarks.ba`.
@@ -16,7 +17,6 @@ so and does nothing. `--vipe FOLDER` is handed to `benchmarks.ba`.
 from __future__ import annotations
 
 import argparse
-import importlib.util
 import os
 import shutil
 import subprocess
@@ -235,8 +235,8 @@ def _sections(vipe: Path | None) -> list[tuple[str, list[str], float]]:
         sections.append((tool, watched, 60))
     peer = ["--vipe", str(vipe)] if vipe else []
     sections.append(("ba", [sys.executable, "-m", "benchmarks.ba", *peer], 90))
-    if importlib.util.find_spec("benchmarks.gpu_pipeline"):
-        sections.append(("pipeline", [sys.executable, "-m", "benchmarks.gpu_pipeline"], 120))
+    sections.append(("network", [sys.executable, "-m", "pytest", "-q", "tests/priors/test_droid_gpu.py"], 45))
+    sections.append(("pipeline", [sys.executable, "-m", "benchmarks.gpu_pipeline", "--frames", "90"], 75))
     return sections
 
 

@@ -95,7 +95,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     on_gpu = device.type == "cuda"
     width, height = (int(side) for side in (arguments.size or ("640x480" if on_gpu else "64x48")).split("x"))
     frames = arguments.frames or (300 if on_gpu else 12)
-    every = arguments.every or (6 if on_gpu else 1)
+    every = arguments.every or (6 if on_gpu else 2)
     counts = arguments.videos or ([1, 2, 4, 8] if on_gpu else [1, 2])
     settings = _settings(lean=arguments.lean, short=not on_gpu)
 

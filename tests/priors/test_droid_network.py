@@ -147,6 +147,22 @@ def test_lean_and_full_refinements_say_the_same_and_forget_what_they_are_told_to
     torch.testing.assert_close(full.damping, lean_answer.damping, atol=1e-3, rtol=1e-4)
 
 
+def test_an_overflow_is_no_measurement_and_does_not_stay(network: DroidNetwork) -> None:
+    matcher = DroidMatcher(network)
+    frames = [matcher.encode(working(seed, seed)) for seed in range(2)]
+    seen = frames[0].grid.sample_px(torch.float32)[None] + 2
+    refinement = matcher.begin(frames[0].grid, lean=False)
+    refinement.add([(frames[0], frames[1])], seen)
+    refinement._hidden = torch.full_like(frames[0].context[0][None], torch.nan)
+    lost = refinement.update(seen, [0])
+    torch.testing.assert_close(lost.target_px, seen)
+    assert not lost.weight.any()
+    after = refinement.update(seen, [0])
+    assert after.target_px.isfinite().all()
+    assert after.weight.any()
+    assert after.damping.isfinite().all()
+
+
 def test_masked_cells_have_no_weight_and_a_pair_can_be_matched_without_geometry(network: DroidNetwork) -> None:
     matcher = DroidMatcher(network)
     first, second = working(1), working(2, 1)

@@ -93,7 +93,10 @@ class DroidRefinement:
             said[index] = seen[index] + updated.delta.permute(0, 2, 3, 1)
             weight[index] = updated.weight.permute(0, 2, 3, 1)
             dampings.append(updated.damping.flatten(1))
-        self._hidden, self._said = hidden, said
+        # Half precision may overflow; what it says then is nothing, and must not be what the next update starts from.
+        sound = said.isfinite() & weight.isfinite()
+        said, weight = torch.where(sound, said, seen), torch.where(sound, weight, 0.0)
+        self._hidden, self._said = hidden.nan_to_num(0.0, 1.0, -1.0), said
         usable = torch.stack([source.usable for source, _ in self._pairs])
         return Refined(
             said.flatten(1, 2) * self._grid.stride + self._grid.offset,
