@@ -101,7 +101,7 @@ class DroidRefinement:
         return Refined(
             said.flatten(1, 2) * self._grid.stride + self._grid.offset,
             weight.flatten(1, 2) * usable[..., None],
-            _DAMPING * torch.cat(dampings),
+            _DAMPING * torch.cat(dampings).nan_to_num(0.0, 0.0),
         )
 
     def _parts(self, sources: Sequence[int]) -> list[list[int]]:
