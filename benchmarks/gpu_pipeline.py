@@ -266,6 +266,7 @@ def _print_plan(
             keyframes=keyframes,
             window_edges=schedule.window_edges,
             edges_per_keyframe=schedule.global_edges,
+            most_edges=schedule.global_most_edges,
             fill_frames=settings.infill_batch,
             cache_bytes=settings.frame_cache_bytes,
             lean=lean,

@@ -89,6 +89,7 @@ def test_memory_is_planned_from_sizes_and_volumes_give_way_on_small_devices() ->
             keyframes=keyframes,
             window_edges=48,
             edges_per_keyframe=16,
+            most_edges=6000,
             fill_frames=16,
             cache_bytes=256 << 20,
             lean=lean,

@@ -55,6 +55,7 @@ def plan_memory(
     keyframes: int,
     window_edges: int,
     edges_per_keyframe: int,
+    most_edges: int,
     fill_frames: int,
     cache_bytes: int,
     lean: bool,
@@ -66,7 +67,8 @@ def plan_memory(
         grid: Cells of its working pictures.
         keyframes: That it will have, about.
         window_edges: Most edges of the window.
-        edges_per_keyframe: Most edges of the global graph.
+        edges_per_keyframe: Most edges of the global graph ...
+        most_edges: ... and of all of it, but for those to the three keyframes on either side.
         fill_frames: Frames between keyframes that are posed at once, from two keyframes each.
         cache_bytes: Of features of frames that are kept from pass to pass.
         lean: Without volumes of correlation; see `Refiner.begin`.
@@ -76,11 +78,11 @@ def plan_memory(
     volume_bytes = 0 if lean else _volume_bytes(grid, value_bytes)
     update_bytes = cells * (value_bytes * (_LIVE_CHANNELS + NUM_CHANNELS) + 4 * 8)
     at_once = max(window_edges, 2 * fill_frames)
-    graph_edges = edges_per_keyframe * keyframes
+    graph_edges = min(edges_per_keyframe * keyframes, max(most_edges, 6 * keyframes))
     return MemoryPlan(
         process_bytes=_PROCESS_BYTES,
         keyframe_bytes=cache_bytes + keyframes * cells * (3 * 128 * value_bytes + 8),
-        graph_bytes=graph_edges * cells * (2 * 128 * value_bytes + 2 * 16),
+        graph_bytes=graph_edges * cells * (128 * value_bytes + 2 * 16),
         work_bytes=max(at_once * (update_bytes + 2 * volume_bytes), _LEAN_EDGES * update_bytes),
     )
 

@@ -67,6 +67,7 @@ class DroidRefinement:
         if self._correlation is not None:
             self._correlation = None if self._lean else self._correlation.kept(index)
 
+    @torch.inference_mode()
     def update(self, seen_px: Tensor, sources: Sequence[int]) -> Refined:
         """See `Refinement.update`."""
         assert self._hidden is not None
@@ -74,7 +75,7 @@ class DroidRefinement:
         device = self._network.device
         seen = self._in_cells(seen_px)
         numbers = torch.tensor(list(sources), dtype=torch.int64, device=device)
-        hidden, said = torch.empty_like(self._hidden), torch.empty_like(self._said)
+        said = torch.empty_like(self._said)
         weight = torch.empty_like(self._said)
         dampings = []
         correlation = self._correlated()
@@ -89,14 +90,15 @@ class DroidRefinement:
                 motion.permute(0, 3, 1, 2),
                 shares(numbers[index])[1],
             )
-            hidden[index] = updated.hidden.to(hidden.dtype)
+            # In place, part by part: the states of a large graph are most of what there is.
+            self._hidden[index] = updated.hidden.to(self._hidden.dtype).nan_to_num(0.0, 1.0, -1.0)
             said[index] = seen[index] + updated.delta.permute(0, 2, 3, 1)
             weight[index] = updated.weight.permute(0, 2, 3, 1)
             dampings.append(updated.damping.flatten(1))
         # Half precision may overflow; what it says then is nothing, and must not be what the next update starts from.
         sound = said.isfinite() & weight.isfinite()
         said, weight = torch.where(sound, said, seen), torch.where(sound, weight, 0.0)
-        self._hidden, self._said = hidden.nan_to_num(0.0, 1.0, -1.0), said
+        self._said = said
         usable = torch.stack([source.usable for source, _ in self._pairs])
         return Refined(
             said.flatten(1, 2) * self._grid.stride + self._grid.offset,

@@ -52,7 +52,8 @@ class RefinedBackend:
         if count < 2:
             return
         settings = self._settings
-        reach = Reach(settings.neighbours, self._max_px, settings.global_gap, settings.global_edges * count)
+        most = min(settings.global_edges * count, settings.global_most_edges)
+        reach = Reach(settings.neighbours, self._max_px, settings.global_gap, most)
         found = links(self._reprojector, self._keyframes, range(count), range(count), (), reach, settings)
         edges = RefinedEdges(self._refiner, self._keyframes, self._adjuster, lean=True)
         edges.add(found)

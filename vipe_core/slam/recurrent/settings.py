@@ -32,7 +32,8 @@ class RefinementSettings:
         reused: Edges that are not refined any more take part when both ends are at most this far before the window.
         global_px: Farthest pair that is linked in a global adjustment.
         global_gap: Links there are kept this many steps apart.
-        global_edges: Most edges per keyframe there.
+        global_edges: Most edges per keyframe there ...
+        global_most_edges: ... and in all, but for those to neighbours: bounds the memory of long videos.
         global_updates: Updates of a global adjustment on the way, of the first and of the second at the end.
         global_iterations: Gauss-Newton steps after each of these updates.
         fill_updates: Updates of the frames between keyframes.
@@ -58,6 +59,7 @@ class RefinementSettings:
     global_px: float = 220.0
     global_gap: int = 3
     global_edges: int = 16
+    global_most_edges: int = 6000
     global_updates: tuple[int, int, int] = (5, 7, 24)
     global_iterations: int = 8
     fill_updates: int = 10
