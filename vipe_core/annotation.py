@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Mapping
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -129,8 +129,8 @@ class Progress:
     """How far an annotation is.
 
     Attributes:
-        stage: `scan`, `intrinsics`, `track`, `backend`, `infill`, `scale` (only with metric depth) or `depth`, in this
-            order.
+        stage: `masks` (only where things are found by phrases), `scan`, `intrinsics`, `track`, `backend`, `infill`,
+            `scale` (only with metric depth) or `depth`, in this order.
         frames_done: Frames of the stage that are done.
         frames_total: Frames of the stage, or None while the number is not known.
     """
@@ -145,7 +145,10 @@ ProgressCallback = Callable[[Progress], None]
 
 
 MASK_PHRASES = {0: "background", 1: "moving"}
-"""What the ids of a mask stand for."""
+"""What the ids of every mask stand for. 1 is what moves by itself, as geometry or the user says."""
+
+FIRST_INSTANCE, LAST_INSTANCE = 2, 255
+"""Ids of the things that a network found, each with its own phrase."""
 
 MEASURED, FILLED, SKY, MOVING, UNOBSERVED = range(5)
 """Where the depth of a pixel comes from: several views agree on it; it is filled in from what is around it; it is sky,
@@ -163,7 +166,7 @@ class DenseFrame:
         rgb: (H, W, 3) uint8, upright, at source resolution.
         depth: (H, W) float32 in units of the trajectory; 0 where there is no value.
         confidence: (H, W) float32 in 0..1; what is filled in, not measured, has 0.05 at most, what moves 0.
-        mask: (H, W) uint8 instance ids, `MASK_PHRASES` says of what; 0 is the static background.
+        mask: (H, W) uint8 ids, `Annotation.mask_phrases` says of what; 0 is the static background.
         kind: (H, W) uint8, where the depth comes from: `MEASURED`, `FILLED`, `SKY`, `MOVING` or `UNOBSERVED`.
     """
 
@@ -188,6 +191,7 @@ class Annotation:
         scale: `metric` is metres; `relative` one unknown scale for poses and depth together, in units in which the
             median inverse depth of the map is 1. `provenance.scale_source` says where it is from.
         depth_kind: `z` along the optical axis, `ray` distance from the centre.
+        mask_phrases: What the ids of the masks stand for: `MASK_PHRASES`, and a phrase for each thing that was found.
         timings_s: Wall seconds per stage. Filled further while `dense` is consumed; never part of the payload bytes.
         dense: Starts the dense stream: every frame in order, once per call, in bounded memory. Closing it ends its
             decoders.
@@ -205,6 +209,7 @@ class Annotation:
     provenance: Provenance
     dense: Callable[[], Generator[DenseFrame, None, None]]
     timings_s: dict[str, float] = field(default_factory=dict)
+    mask_phrases: Mapping[int, str] = field(default_factory=lambda: dict(MASK_PHRASES))
 
     @property
     def num_frames(self) -> int:

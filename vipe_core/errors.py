@@ -16,6 +16,7 @@
     │   ├── DecodeTimeout         decode_timeout      (retryable)
     │   └── DecodeCrashed         decode_crashed      (retryable)
     ├── ConfigError           invalid_config          a preset, camera or device that does not exist
+    │   ├── LibraryMissing        library_missing     a preset needs a library that is not installed
     │   ├── WeightsMissing        weights_missing     a preset's network weights are not on this machine
     │   └── WeightsInvalid        weights_invalid     a file of weights is not what it should be
     ├── FormatError           format_error            an artifact on disk does not hold what it must
@@ -131,6 +132,12 @@ class DecodeCrashed(DecodeError):
 
 class ConfigError(VipeError):
     code = "invalid_config"
+
+
+class LibraryMissing(ConfigError):
+    """A preset needs a library that is an extra and not installed; the message names the command that installs it."""
+
+    code = "library_missing"
 
 
 class WeightsMissing(ConfigError):

@@ -59,6 +59,20 @@ def annotate(
             "names. Writes one sequence per view, and the rig as it was found.",
         ),
     ] = None,
+    phrases: Annotated[
+        str | None,
+        typer.Option(
+            metavar="A,B,...",
+            help="Find, follow and mask what these words name (extra hf); '' for nothing. Default: the preset's own.",
+        ),
+    ] = None,
+    detection_interval: Annotated[
+        float | None, typer.Option(metavar="SECONDS", help="Time between looks for new things. Default: 2.")
+    ] = None,
+    metric_depth: Annotated[
+        str | None,
+        typer.Option(metavar="NETWORK", help="What tells the scale, such as hf.depth_pro or nvidia_vipe.unidepth."),
+    ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="One JSON line per input on stdout, nothing else.")] = False,
 ) -> None:
     """Annotate videos on this machine, without the service.
@@ -72,6 +86,7 @@ def annotate(
     from vipe_core.errors import ConfigError, VipeError
     from vipe_core.formats import SequenceNames
     from vipe_core.pipeline.annotator import Annotator
+    from vipe_core.pipeline.presets import PresetOptions
     from vipe_core.video.limits import use_limits
 
     paths = list(inputs or [])
@@ -88,7 +103,11 @@ def annotate(
             raise typer.BadParameter(str(error), param_hint="--scale-from") from error
     use_limits(read_settings().media_limits())
     console = Console(stderr=True, quiet=as_json)
+    words = None if phrases is None else tuple(word.strip() for word in phrases.split(",") if word.strip())
+    options = PresetOptions(words, detection_interval, metric_depth)
     if rig is not None:
+        if options != PresetOptions():
+            raise typer.BadParameter("a rig is annotated without networks for masks and scale", param_hint="--rig")
         from services.cli.annotate_rig import annotate_rig
 
         engine = {"preset": preset, "camera": camera, "device": device}
@@ -98,7 +117,7 @@ def annotate(
                 _print_json(row)
         _show(views, output, as_json=as_json)
         return
-    annotator = Annotator(preset=preset, camera=camera, device=device)
+    annotator = Annotator(preset=preset, camera=camera, device=device, options=options)
     names = SequenceNames(output)
     rows: list[dict[str, Any]] = []
     for path in paths:

@@ -15,13 +15,13 @@ def list_models() -> None:
 
     from services.cli.tables import results_console
     from vipe_core.pipeline.presets import PRESETS, resolve
-    from vipe_core.priors.weights import WEIGHTS, path_of, record_of, weights_folder
+    from vipe_core.priors.weights import WEIGHTS, path_of, record_of, selected, weights_folder
 
     table = Table(show_edge=False, pad_edge=False, header_style="bold")
     for title in ("name", "presets", "licence", "MB", "here", "SHA-256", "project"):
         table.add_column(title, overflow="fold")
     for name, weights in WEIGHTS.items():
-        presets = ", ".join(preset for preset in PRESETS if name in resolve(preset).weights)
+        presets = ", ".join(preset for preset in PRESETS if name in selected(resolve(preset).weights))
         record = record_of(name)
         sha256 = weights.sha256 or (f"{record.sha256} (of the first pull)" if record else "not published")
         here = "yes" if path_of(name).is_file() else "no"
@@ -46,9 +46,9 @@ def pull(
     Where no checksum is published, that of the first pull is written down and every later one must agree.
     """
     from services.weights import pull as pull_weights
-    from vipe_core.priors.weights import WEIGHTS, known
+    from vipe_core.priors.weights import WEIGHTS, known, selected
 
-    chosen = names or list(WEIGHTS)
+    chosen = selected(names or WEIGHTS)
     if (sha256 or (origin or "").startswith("http")) and len(chosen) != 1:
         raise typer.BadParameter("an address or a checksum belongs to one name", param_hint="NAMES")
     for name in chosen:
@@ -62,9 +62,9 @@ def pull(
 
 def verify(names: Names = None) -> None:
     """Compare checksums of the weights on this machine with the published ones, or those of the first pull."""
-    from vipe_core.priors.weights import WEIGHTS, expected_sha256, path_of, require
+    from vipe_core.priors.weights import WEIGHTS, expected_sha256, path_of, require, selected
 
-    for name in names or [name for name in WEIGHTS if path_of(name).is_file()]:
+    for name in selected(names) if names else [name for name in WEIGHTS if path_of(name).is_file()]:
         installed = require(name)
         known_by = "as it should be" if expected_sha256(name) else "nothing to compare it with: it was not pulled"
         typer.echo(f"{name}: {installed.sha256}, {known_by}")
@@ -76,7 +76,8 @@ def mirror(
 ) -> None:
     """Copy the weights on this machine to object storage, for `vipectl models pull --from`."""
     from services.weights import mirror as mirror_weights
-    from vipe_core.priors.weights import WEIGHTS, path_of
+    from vipe_core.priors.weights import WEIGHTS, path_of, selected
 
-    for address in mirror_weights(names or [name for name in WEIGHTS if path_of(name).is_file()], uri):
+    here = [name for name in WEIGHTS if path_of(name).is_file()]
+    for address in mirror_weights(list(selected(names)) if names else here, uri):
         typer.echo(address)

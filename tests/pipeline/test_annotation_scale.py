@@ -135,4 +135,4 @@ def test_depth_providers_have_names() -> None:
         Annotator(replace(resolve("classical"), depth="nothing"))
     with pytest.raises(ConfigError, match="already"):
         register_depth("classical.plane_sweep", lambda device: DepthFamily())
-    assert open_depth("classical.plane_sweep", Annotator().device) == DepthFamily()
+    assert open_depth("classical.plane_sweep", "none", Annotator().device) == DepthFamily()

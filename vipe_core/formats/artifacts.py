@@ -20,7 +20,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from vipe_core.annotation import DEPTH_KINDS, MASK_PHRASES, Annotation, DenseFrame, DepthKind
+from vipe_core.annotation import DEPTH_KINDS, Annotation, DenseFrame, DepthKind
 from vipe_core.cameras import Camera, CameraModel
 from vipe_core.errors import EngineError
 from vipe_core.formats.depth_zip import DepthZipWriter
@@ -181,7 +181,8 @@ def _write_all(
         path.write_text("".join(f"{index}: {kind}\n" for index in range(count)), encoding="ascii")
     if "mask" in attributes:
         path = new("mask_txt", artifact_path(work, name, "mask", "txt"))
-        path.write_text("".join(f"{number}: {phrase}\n" for number, phrase in MASK_PHRASES.items()), encoding="ascii")
+        phrases = sorted(annotation.mask_phrases.items())
+        path.write_text("".join(f"{number}: {phrase}\n" for number, phrase in phrases), encoding="utf-8")
     dense = {
         key: new(key, artifact_path(work, name, attribute, suffix))
         for key, attribute, suffix in _DENSE

@@ -12,7 +12,15 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from vipe_core.annotation import Annotation, DenseFrame, Progress, ProgressCallback, Provenance, depth_kind_of
+from vipe_core.annotation import (
+    MASK_PHRASES,
+    Annotation,
+    DenseFrame,
+    Progress,
+    ProgressCallback,
+    Provenance,
+    depth_kind_of,
+)
 from vipe_core.depth.aligned import AlignedDepth
 from vipe_core.depth.known import KnownLength
 from vipe_core.depth.scene import scene_of
@@ -20,14 +28,16 @@ from vipe_core.depth.stream import DenseDepth
 from vipe_core.depth.without import NoDepth
 from vipe_core.errors import EngineError, VipeError
 from vipe_core.pipeline.device import describe_device, resolve_device, set_threads
-from vipe_core.pipeline.presets import Preset, resolve
+from vipe_core.pipeline.masking import find_instances
+from vipe_core.pipeline.presets import Preset, PresetOptions, resolve
 from vipe_core.pipeline.provenance import engine_version, library_versions
-from vipe_core.pipeline.providers import open_depth, open_priors
+from vipe_core.pipeline.providers import open_depth, open_masks, open_priors, require_libraries
 from vipe_core.pipeline.scaling import ScaledScene, set_scale
-from vipe_core.priors.weights import require
+from vipe_core.priors.weights import require_all
 from vipe_core.quality import assess
 from vipe_core.slam.system import Slam
 from vipe_core.video import MaskedView, open_source
+from vipe_core.video.instances import InstanceMaps, InstanceView
 from vipe_core.video.source import FrameSource
 
 logger = logging.getLogger(__name__)
@@ -42,11 +52,12 @@ class Annotator:
         device: `cpu`, `cuda` or `cuda:N`: where bundle adjustment and networks run.
         threads: CPU threads of torch and OpenCV in this process. The result depends on it in the last digits; one is
             the choice that gives the same bytes everywhere, and the most videos per hour of a machine.
+        options: What is changed of the preset.
 
     Raises:
-        ConfigError: Preset, camera or device is not on offer.
-        WeightsMissing, WeightsInvalid: The weights that the preset needs are not on this machine, or are damaged; both
-            are ConfigErrors, and the message names the command that fetches them.
+        ConfigError: Preset, camera, device or options are not on offer.
+        LibraryMissing, WeightsMissing, WeightsInvalid: What the preset needs is not on this machine; the message says
+            what gets it.
     """
 
     def __init__(
@@ -56,14 +67,17 @@ class Annotator:
         device: str = "cpu",
         *,
         threads: int = 1,
+        options: PresetOptions | None = None,
     ) -> None:
-        self.preset = resolve(preset, camera)
+        self.preset = resolve(preset, camera, options)
         self.device = resolve_device(device)
         self.threads = threads
         set_threads(threads)
-        self._weights = {name: require(name).sha256 for name in self.preset.weights}
-        self._priors = open_priors(self.preset.matcher, self.preset.camera, self.device)
-        self._depth = open_depth(self.preset.depth, self.device)
+        require_libraries(self.preset.providers.values())
+        self._weights = require_all(self.preset.weights)
+        self._priors = open_priors(self.preset.matcher, self.preset.intrinsics, self.preset.camera, self.device)
+        self._depth = open_depth(self.preset.depth, self.preset.metric, self.device)
+        self._masks = open_masks(self.preset.masks, self.preset.instances, self.device)
 
     def annotate(
         self,
@@ -98,6 +112,13 @@ class Annotator:
         if masks is not None:
             source = MaskedView(source, masks)
         report = Reporter(progress)
+        instances: InstanceMaps | None = None
+        masks_start_s = time.perf_counter()
+        if self._masks is not None:
+            with typed_errors(source, report):
+                instances = find_instances(source, self._masks, report)
+            source = InstanceView(source, instances)
+        masks_s = time.perf_counter() - masks_start_s
 
         slam = Slam(self._priors(), self.preset.slam, self.device)
         with typed_errors(source, report), torch.inference_mode():
@@ -106,6 +127,8 @@ class Annotator:
             scaled = set_scale(scene_of(result), source, known, self._depth.metric, report)
             quality = dataclasses.replace(quality, scale_sigma_ratio=scaled.sigma_ratio)
         timings = dict(result.timings_s)
+        if instances is not None:
+            timings = {"masks": masks_s, **timings}
         logger.info(
             "%s: %d frames, %d keyframes, reliable: %s %s",
             source.info.name,
@@ -125,11 +148,14 @@ class Annotator:
             depth_kind=depth_kind_of(result.camera),
             quality=quality,
             provenance=self._provenance(source, scaled),
-            dense=lambda: self._dense(source, scaled, timings, report),
+            dense=lambda: self._dense(source, scaled, instances, timings, report),
             timings_s=timings,
+            mask_phrases=dict(MASK_PHRASES) if instances is None else instances.phrases,
         )
 
     def _provenance(self, source: FrameSource, scaled: ScaledScene) -> Provenance:
+        if isinstance(source, InstanceView):
+            source = source.source
         info = source.info
         return Provenance(
             engine_version=engine_version(),
@@ -156,6 +182,7 @@ class Annotator:
         self,
         source: FrameSource,
         scaled: ScaledScene,
+        instances: InstanceMaps | None,
         timings: dict[str, float],
         report: Reporter,
     ) -> Generator[DenseFrame, None, None]:
@@ -174,6 +201,9 @@ class Annotator:
                 if frame is None:
                     return
                 mask = frame.moving.astype(np.uint8)
+                if instances is not None:
+                    ids = instances.ids(frame.index, mask.shape[1], mask.shape[0])
+                    mask = np.where(ids > 0, ids, mask)
                 yield DenseFrame(frame.index, frame.rgb, frame.depth, frame.confidence, mask, frame.kind)
                 report("depth", frame.index + 1, total)
 

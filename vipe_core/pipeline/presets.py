@@ -10,14 +10,41 @@ from dataclasses import dataclass, field
 from vipe_core.depth.alignment import AlignmentSettings
 from vipe_core.depth.types import DepthSettings
 from vipe_core.errors import ConfigError
+from vipe_core.priors.instances import InstanceSettings
 from vipe_core.slam.settings import EnergyTerms, SlamSettings
 
 CAMERAS = ("pinhole", "mei", "auto")
-NO_DEPTH = "none"
-"""What `Preset.depth` says where no dense depth is made."""
+NONE = "none"
+"""The provider of a role that nobody fills: no tracks, no dense depth, no metric depth, no masks."""
 
-_NO_TRACKS = "none"
-_PROVIDER_WEIGHTS: dict[str, tuple[str, ...]] = {"droid.network": ("droid",)}
+FOUND_BY_PHRASES = "hf.grounding_dino_sam2"
+"""The provider of masks of what phrases name."""
+
+VIDEO_DEPTH = "nvidia_vipe.video_depth_anything"
+"""Dense depth by video depth that is aligned to the map, which is completed where it is sparse."""
+
+GEOCALIB = {"pinhole": "nvidia_vipe.geocalib_pinhole", "mei": "nvidia_vipe.geocalib_distorted"}
+"""Camera model -> the provider of the initial camera that is a network."""
+
+METRIC_DEPTH = (
+    NONE,
+    "hf.depth_pro",
+    "hf.depth_anything_indoor",
+    "hf.depth_anything_outdoor",
+    "nvidia_vipe.metric3d_small",
+    "nvidia_vipe.metric3d_large",
+    "nvidia_vipe.metric3d_giant2",
+    "nvidia_vipe.unidepth",
+    "nvidia_vipe.unik3d",
+)
+"""Networks that tell the scale."""
+
+_PROVIDER_WEIGHTS: dict[str, tuple[str, ...]] = {
+    "droid.network": ("droid",),
+    FOUND_BY_PHRASES: ("grounding_dino", "sam2_video"),
+    VIDEO_DEPTH: ("video_depth_anything", "priorda"),
+    **{provider: (provider.partition(".")[2],) for provider in (*GEOCALIB.values(), *METRIC_DEPTH[1:])},
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,9 +58,12 @@ class Preset:
         sparse: Provider of sparse tracks.
         intrinsics: Provider of the initial camera.
         depth: Providers of dense depth, a name of `providers.py`.
+        metric: Provider of metric depth, `none` where scale is what the user says or relative.
+        masks: Provider of masks, `none` where only geometry and the user say what must not be used.
         slam: Settings of the SLAM stage.
         dense_depth: Settings of the depth stage where depth is multi-view stereo.
         alignment: Settings of the depth stage where the depth providers have video depth.
+        instances: What masks are of.
     """
 
     name: str
@@ -42,9 +72,12 @@ class Preset:
     sparse: str
     intrinsics: str
     depth: str
+    metric: str = NONE
+    masks: str = NONE
     slam: SlamSettings = field(default_factory=SlamSettings)
     dense_depth: DepthSettings = field(default_factory=DepthSettings)
     alignment: AlignmentSettings = field(default_factory=AlignmentSettings)
+    instances: InstanceSettings = field(default_factory=InstanceSettings)
 
     def canonical_json(self) -> str:
         """All fields, keys sorted, no white space: equal presets give equal text."""
@@ -63,6 +96,8 @@ class Preset:
             "sparse_tracks": self.sparse,
             "intrinsics_init": self.intrinsics,
             "dense_depth": self.depth,
+            "metric_depth": self.metric,
+            "masks": self.masks,
         }
 
     @property
@@ -73,7 +108,43 @@ class Preset:
     @property
     def makes_depth(self) -> bool:
         """Whether its dense stream has any depth."""
-        return self.depth != NO_DEPTH
+        return self.depth != NONE
+
+
+@dataclass(frozen=True, slots=True)
+class PresetOptions:
+    """What a user changes of a preset; None leaves it as it is.
+
+    Attributes:
+        phrases: What is found, followed and kept out of the way. With them, any preset makes masks; with an empty tuple
+            none does.
+        detection_interval_s: Time between looks for new things.
+        metric_depth: Network that tells the scale, one of `METRIC_DEPTH`.
+    """
+
+    phrases: tuple[str, ...] | None = None
+    detection_interval_s: float | None = None
+    metric_depth: str | None = None
+
+    def applied(self, preset: Preset) -> Preset:
+        """The preset with the changes.
+
+        Raises:
+            ConfigError: The phrases or the interval cannot be, or there is no such network.
+        """
+        if self.metric_depth is not None and self.metric_depth not in METRIC_DEPTH:
+            raise ConfigError(f"unknown metric depth {self.metric_depth!r}; on offer: {', '.join(METRIC_DEPTH)}")
+        masks, instances = preset.masks, preset.instances
+        if self.phrases is not None:
+            masks = FOUND_BY_PHRASES if self.phrases else NONE
+            if self.phrases:
+                instances = dataclasses.replace(instances, phrases=self.phrases)
+        if self.detection_interval_s is not None:
+            if masks == NONE:
+                raise ConfigError("a time between detections means nothing without phrases to look for")
+            instances = dataclasses.replace(instances, interval_s=self.detection_interval_s)
+        metric = preset.metric if self.metric_depth is None else self.metric_depth
+        return dataclasses.replace(preset, masks=masks, instances=instances, metric=metric)
 
 
 _CLASSICAL = Preset(
@@ -88,7 +159,7 @@ _CLASSICAL = Preset(
 _NETWORK = dataclasses.replace(
     _CLASSICAL,
     matcher="droid.network",
-    sparse=_NO_TRACKS,
+    sparse=NONE,
     slam=SlamSettings(working_area_px=512 * 384, terms=EnergyTerms(sparse_tracks=False)),
     dense_depth=DepthSettings.fast(),
 )
@@ -99,7 +170,15 @@ _PRESETS = {
         dataclasses.replace(_CLASSICAL, name="classical_fast", dense_depth=DepthSettings.fast()),
         dataclasses.replace(_CLASSICAL, name="wide_angle", camera="mei"),
         dataclasses.replace(_NETWORK, name="vipe_fast"),
-        dataclasses.replace(_NETWORK, name="pose_only", depth=NO_DEPTH),
+        dataclasses.replace(_NETWORK, name="pose_only", depth=NONE),
+        dataclasses.replace(
+            _NETWORK,
+            name="vipe",
+            intrinsics=GEOCALIB["pinhole"],
+            depth=VIDEO_DEPTH,
+            metric="nvidia_vipe.metric3d_large",
+            masks=FOUND_BY_PHRASES,
+        ),
     )
 }
 _INTRINSICS = {
@@ -111,14 +190,16 @@ _INTRINSICS = {
 PRESETS = tuple(_PRESETS)
 """Names, the default first. `classical_fast` has the same poses and map, and coarser dense depth for less time;
 `wide_angle` estimates the bend of the lens as well. `vipe_fast` and `pose_only` find poses as the paper does, by the
-DROID network and bundle adjustment in turns, and need its weights; the one has coarse dense depth, the other none."""
+DROID network and bundle adjustment in turns, and need its weights; the one has coarse dense depth, the other none.
+`vipe` is the paper's whole: masks of what its phrases name, the camera from GeoCalib, metric depth, and video depth
+aligned to the map; it needs the extras `hf` and `nvidia-vipe`, and their weights."""
 
 
-def resolve(preset: str | Preset, camera: str | None = None) -> Preset:
-    """The preset of that name, for that camera model or its own.
+def resolve(preset: str | Preset, camera: str | None = None, options: PresetOptions | None = None) -> Preset:
+    """The preset of that name, for that camera model or its own, with the user's changes.
 
     Raises:
-        ConfigError: It is not on offer; the message lists what is.
+        ConfigError: It is not on offer, and the message lists what is; or the changes cannot be.
     """
     if isinstance(preset, Preset):
         found = preset
@@ -129,4 +210,7 @@ def resolve(preset: str | Preset, camera: str | None = None) -> Preset:
     camera = found.camera if camera is None else camera
     if camera not in CAMERAS:
         raise ConfigError(f"camera model {camera!r} is not on offer for annotation; on offer: {', '.join(CAMERAS)}")
-    return dataclasses.replace(found, camera=camera, intrinsics=_INTRINSICS[camera])
+    learned = found.intrinsics in GEOCALIB.values() and camera in GEOCALIB
+    intrinsics = GEOCALIB[camera] if learned else _INTRINSICS[camera]
+    found = dataclasses.replace(found, camera=camera, intrinsics=intrinsics)
+    return found if options is None else options.applied(found)

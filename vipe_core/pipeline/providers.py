@@ -1,17 +1,28 @@
-"""The providers by name: what the fields of a `Preset` may say."""
+"""The providers by name: what the fields of a `Preset` may say.
+
+Networks are imported when they are opened: their libraries are extras, and take seconds.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import dataclasses
+import importlib.util
+from collections.abc import Callable, Iterable
+from typing import TYPE_CHECKING
 
 import torch
 
-from vipe_core.errors import ConfigError
-from vipe_core.pipeline.presets import NO_DEPTH
+from vipe_core.errors import ConfigError, LibraryMissing
+from vipe_core.pipeline.presets import FOUND_BY_PHRASES, GEOCALIB, NONE, VIDEO_DEPTH
 from vipe_core.priors.classical import classical_priors
 from vipe_core.priors.droid import DroidMatcher, load_network
-from vipe_core.priors.protocols import DepthFamily, PriorFamily
-from vipe_core.priors.weights import require
+from vipe_core.priors.instances import FollowedInstances, InstanceSettings
+from vipe_core.priors.protocols import DepthFamily, InstanceMasks, MetricDepth, PriorFamily
+from vipe_core.priors.rectified import Rectified
+from vipe_core.priors.weights import folder_of, path_of
+
+if TYPE_CHECKING:
+    from vipe_core.priors.nvidia_vipe.metric_depth import Metric3dSize
 
 DepthOpener = Callable[[torch.device], DepthFamily]
 """Device -> providers, ready to be used for any number of videos."""
@@ -22,10 +33,96 @@ PriorMaker = Callable[[], PriorFamily]
 PriorOpener = Callable[[str, torch.device], PriorMaker]
 """(camera model, device) -> maker; loads what all videos share."""
 
+MetricOpener = Callable[[torch.device], MetricDepth]
+MaskOpener = Callable[[InstanceSettings, torch.device], InstanceMasks]
+
+
+def require_libraries(providers: Iterable[str]) -> None:
+    """Make sure that the extras of these providers are installed.
+
+    Raises:
+        LibraryMissing: One is not; the message says what installs it.
+    """
+    from vipe_core.priors.hf.loading import EXTRA
+    from vipe_core.priors.nvidia_vipe.loading import INSTALL
+
+    needed = {"hf": ("transformers", EXTRA), "nvidia_vipe": ("vipe", INSTALL)}
+    for provider in providers:
+        library, command = needed.get(provider.partition(".")[0], ("", ""))
+        if library and importlib.util.find_spec(library) is None:
+            raise LibraryMissing(
+                f"{provider} needs the library {library}, which is not installed; install it: {command}"
+            )
+
+
+def _video_depth(device: torch.device) -> DepthFamily:
+    from vipe_core.priors.nvidia_vipe.completion import PriorDa
+    from vipe_core.priors.nvidia_vipe.video_depth import VideoDepthAnything
+
+    video = VideoDepthAnything.load(path_of("video_depth_anything"), "vits", device)
+    return DepthFamily(video=video, completion=PriorDa.load(folder_of("priorda"), device))
+
+
+def _depth_pro(device: torch.device) -> MetricDepth:
+    from vipe_core.priors.hf.metric_depth import DepthPro
+
+    return Rectified(DepthPro.load(folder_of("depth_pro"), device))
+
+
+def _depth_anything(scene: str) -> MetricOpener:
+    def opened(device: torch.device) -> MetricDepth:
+        from vipe_core.priors.hf.metric_depth import DepthAnything
+
+        return Rectified(DepthAnything.load(folder_of(f"depth_anything_{scene}"), device))
+
+    return opened
+
+
+def _metric3d(size: Metric3dSize) -> MetricOpener:
+    def opened(device: torch.device) -> MetricDepth:
+        from vipe_core.priors.nvidia_vipe.metric_depth import Metric3d
+
+        return Rectified(Metric3d.load(path_of(f"metric3d_{size}"), size, device))
+
+    return opened
+
+
+def _unidepth(device: torch.device) -> MetricDepth:
+    from vipe_core.priors.nvidia_vipe.metric_depth import UniDepth
+
+    return Rectified(UniDepth.load(folder_of("unidepth"), device))
+
+
+def _unik3d(device: torch.device) -> MetricDepth:
+    from vipe_core.priors.nvidia_vipe.metric_depth import UniK3d
+
+    return UniK3d.load(folder_of("unik3d"), device)
+
+
+def _found_by_phrases(settings: InstanceSettings, device: torch.device) -> InstanceMasks:
+    from vipe_core.priors.hf.grounding_dino import LONGEST, SHORTEST, GroundingDino
+    from vipe_core.priors.hf.sam2_video import Sam2Video
+
+    detector = GroundingDino.load(folder_of("grounding_dino"), device)
+    return FollowedInstances(detector, Sam2Video.load(folder_of("sam2_video"), device), settings, (LONGEST, SHORTEST))
+
+
 _DEPTH: dict[str, DepthOpener] = {
     "classical.plane_sweep": lambda device: DepthFamily(),
-    NO_DEPTH: lambda device: DepthFamily(),
+    VIDEO_DEPTH: _video_depth,
+    NONE: lambda device: DepthFamily(),
 }
+_METRIC: dict[str, MetricOpener] = {
+    "hf.depth_pro": _depth_pro,
+    "hf.depth_anything_indoor": _depth_anything("indoor"),
+    "hf.depth_anything_outdoor": _depth_anything("outdoor"),
+    "nvidia_vipe.metric3d_small": _metric3d("small"),
+    "nvidia_vipe.metric3d_large": _metric3d("large"),
+    "nvidia_vipe.metric3d_giant2": _metric3d("giant2"),
+    "nvidia_vipe.unidepth": _unidepth,
+    "nvidia_vipe.unik3d": _unik3d,
+}
+_MASKS: dict[str, MaskOpener] = {FOUND_BY_PHRASES: _found_by_phrases}
 
 
 def _classical(camera: str, device: torch.device) -> PriorMaker:
@@ -35,7 +132,7 @@ def _classical(camera: str, device: torch.device) -> PriorMaker:
 
 
 def _droid(camera: str, device: torch.device) -> PriorMaker:
-    network = load_network(require("droid").path).ready(device)
+    network = load_network(path_of("droid")).ready(device)
 
     def family() -> PriorFamily:
         matcher = DroidMatcher(network)
@@ -48,8 +145,9 @@ def _droid(camera: str, device: torch.device) -> PriorMaker:
 _PRIORS: dict[str, PriorOpener] = {"classical.dis_flow": _classical, "droid.network": _droid}
 
 
-def open_priors(matcher: str, camera: str, device: torch.device) -> PriorMaker:
-    """The providers of the geometric roles, by that of dense matching.
+def open_priors(matcher: str, intrinsics: str, camera: str, device: torch.device) -> PriorMaker:
+    """The providers of the geometric roles, by that of dense matching; the initial camera is the family's own unless
+    `intrinsics` names a network.
 
     Raises:
         ConfigError: There are none.
@@ -58,7 +156,13 @@ def open_priors(matcher: str, camera: str, device: torch.device) -> PriorMaker:
     """
     if matcher not in _PRIORS:
         raise ConfigError(f"unknown provider of dense matching {matcher!r}; on offer: {', '.join(sorted(_PRIORS))}")
-    return _PRIORS[matcher](camera, device)
+    maker = _PRIORS[matcher](camera, device)
+    if intrinsics not in GEOCALIB.values():
+        return maker
+    from vipe_core.priors.nvidia_vipe.geocalib import GeoCalibInit
+
+    learned = GeoCalibInit.load(path_of(intrinsics.partition(".")[2]), camera, device)
+    return lambda: dataclasses.replace(maker(), intrinsics=learned)
 
 
 def register_depth(name: str, opener: DepthOpener) -> None:
@@ -72,12 +176,41 @@ def register_depth(name: str, opener: DepthOpener) -> None:
     _DEPTH[name] = opener
 
 
-def open_depth(name: str, device: torch.device) -> DepthFamily:
-    """The providers of that name.
+def open_depth(name: str, metric: str, device: torch.device) -> DepthFamily:
+    """The depth providers of that name, with a network for metric depth unless `metric` is `none`.
 
     Raises:
         ConfigError: There are none.
+        LibraryMissing, WeightsMissing, WeightsInvalid: What they need is not on this machine.
     """
     if name not in _DEPTH:
         raise ConfigError(f"unknown depth provider {name!r}; on offer: {', '.join(sorted(_DEPTH))}")
-    return _DEPTH[name](device)
+    if metric != NONE and metric not in _METRIC:
+        raise ConfigError(f"unknown metric depth {metric!r}; on offer: {', '.join(sorted((NONE, *_METRIC)))}")
+    family = _DEPTH[name](device)
+    return family if metric == NONE else dataclasses.replace(family, metric=_METRIC[metric](device))
+
+
+def register_masks(name: str, opener: MaskOpener) -> None:
+    """Put a provider of masks on offer, for presets that name it.
+
+    Raises:
+        ConfigError: The name is taken.
+    """
+    if name in _MASKS:
+        raise ConfigError(f"there is a provider of masks called {name!r} already")
+    _MASKS[name] = opener
+
+
+def open_masks(name: str, settings: InstanceSettings, device: torch.device) -> InstanceMasks | None:
+    """The provider of masks of that name, or None for `none`.
+
+    Raises:
+        ConfigError: There is none of that name.
+        LibraryMissing, WeightsMissing, WeightsInvalid: What it needs is not on this machine.
+    """
+    if name == NONE:
+        return None
+    if name not in _MASKS:
+        raise ConfigError(f"unknown provider of masks {name!r}; on offer: {', '.join(sorted((NONE, *_MASKS)))}")
+    return _MASKS[name](settings, device)

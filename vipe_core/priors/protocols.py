@@ -5,7 +5,7 @@ All images are uint8 working images (see `WorkingFrame`); all pixel coordinates 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable
 
@@ -16,6 +16,7 @@ from torch import Tensor
 from vipe_core.annotation import DepthKind
 from vipe_core.ba.problem import Grid
 from vipe_core.cameras import Camera
+from vipe_core.video.source import Frame
 
 Array = NDArray[Any]
 
@@ -345,3 +346,30 @@ class DepthFamily:
     video: VideoDepth | None = None
     completion: DepthCompletion | None = None
     metric: MetricDepth | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Instances:
+    """The things of one frame.
+
+    Attributes:
+        ids: (h, w) uint8 at the size of the frame: 0, or an id from `FIRST_INSTANCE` on that a thing keeps for as long
+            as it is followed.
+        phrases: What each id so far stands for.
+    """
+
+    ids: NDArray[np.uint8]
+    phrases: Mapping[int, str]
+
+
+class InstanceMasks(Protocol):
+    """Finds things of which phrases tell the kind, and follows them through a video (paper section 3.1).
+
+    Stateless between videos.
+    """
+
+    def input_size(self, width: int, height: int) -> tuple[int, int]:
+        """(width, height) at which a video of that size is best given."""
+
+    def follow(self, frames: Iterable[Frame]) -> Iterator[Instances]:
+        """One answer for every frame, in order, in memory that does not grow with their number."""

@@ -10,6 +10,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -24,7 +25,8 @@ class WeightFile:
 
     Attributes:
         name: What commands and messages call it.
-        file: Its name on disk.
+        file: Its name on disk, which may have a folder. Networks of several files have one of their own, and the name
+            of each file begins with the name of the network.
         urls: Where it is, tried in order.
         sha256: Published checksum; None where nobody has published one: then that of the first pull counts.
         size_bytes: Its size, about; for people.
@@ -41,6 +43,30 @@ class WeightFile:
     project: str
 
 
+def _hub(name: str, repository: str, size_bytes: int, licence: str, files: tuple[str, ...]) -> tuple[WeightFile, ...]:
+    """The files of a network on the hub; the first is the large one."""
+    project = f"https://huggingface.co/{repository}"
+    return tuple(
+        WeightFile(
+            name=f"{name}/{file}",
+            file=f"{name}/{file}",
+            urls=(f"{project}/resolve/main/{file}",),
+            sha256=None,
+            size_bytes=10_000 if number else size_bytes,
+            licence=licence,
+            project=project,
+        )
+        for number, file in enumerate(files)
+    )
+
+
+def _single(name: str, url: str, size_bytes: int, licence: str, project: str) -> WeightFile:
+    return WeightFile(name, url.rsplit("/", 1)[1], (url,), None, size_bytes, licence, project)
+
+
+_NETWORK = ("model.safetensors", "config.json")
+_FOREIGN = "CC-BY-NC-4.0"
+
 WEIGHTS: dict[str, WeightFile] = {
     weights.name: weights
     for weights in (
@@ -55,6 +81,62 @@ WEIGHTS: dict[str, WeightFile] = {
             size_bytes=16_000_000,
             licence="BSD-3-Clause",
             project="https://github.com/princeton-vl/DROID-SLAM",
+        ),
+        *_hub(
+            "grounding_dino",
+            "IDEA-Research/grounding-dino-tiny",
+            690_000_000,
+            "Apache-2.0",
+            (*_NETWORK, "tokenizer.json", "tokenizer_config.json"),
+        ),
+        *_hub("sam2_video", "facebook/sam2.1-hiera-base-plus", 324_000_000, "Apache-2.0", _NETWORK),
+        *_hub("depth_pro", "apple/DepthPro-hf", 1_904_000_000, "apple-amlr", _NETWORK),
+        *(
+            network
+            for scene in ("Indoor", "Outdoor")
+            for network in _hub(
+                f"depth_anything_{scene.lower()}",
+                f"depth-anything/Depth-Anything-V2-Metric-{scene}-Small-hf",
+                99_000_000,
+                "Apache-2.0",
+                _NETWORK,
+            )
+        ),
+        *_hub("unidepth", "lpiccinelli/unidepth-v2-vitl14", 1_400_000_000, _FOREIGN, _NETWORK),
+        *_hub("unik3d", "lpiccinelli/unik3d-vitl", 1_400_000_000, _FOREIGN, _NETWORK),
+        *(
+            _single(
+                f"metric3d_{size}",
+                f"https://huggingface.co/JUGGHM/Metric3D/resolve/main/metric_depth_vit_{size}_800k.pth",
+                size_bytes,
+                "BSD-2-Clause",
+                "https://github.com/YvanYin/Metric3D",
+            )
+            for size, size_bytes in (("small", 150_000_000), ("large", 1_650_000_000), ("giant2", 5_500_000_000))
+        ),
+        *(
+            _single(
+                f"geocalib_{kind}",
+                f"https://github.com/cvg/GeoCalib/releases/download/v1.0/geocalib-{kind}.tar",
+                110_000_000,
+                "Apache-2.0",
+                "https://github.com/cvg/GeoCalib",
+            )
+            for kind in ("pinhole", "distorted")
+        ),
+        _single(
+            "video_depth_anything",
+            "https://huggingface.co/depth-anything/Video-Depth-Anything-Small/resolve/main/video_depth_anything_vits.pth",
+            116_000_000,
+            "Apache-2.0",
+            "https://github.com/DepthAnything/Video-Depth-Anything",
+        ),
+        *_hub(
+            "priorda",
+            "Rain729/Prior-Depth-Anything",
+            390_000_000,
+            "Apache-2.0, of which Depth Anything V2 Base is CC-BY-NC-4.0",
+            ("prior_depth_anything_vitb.pth", "depth_anything_v2_vitb.pth"),
         ),
     )
 }
@@ -103,8 +185,44 @@ def known(name: str) -> WeightFile:
         WeightsMissing: There is none; the message lists what there is.
     """
     if name not in WEIGHTS:
-        raise WeightsMissing(f"there are no weights called {name!r}; known: {', '.join(sorted(WEIGHTS))}")
+        families = sorted({file.partition("/")[0] for file in WEIGHTS})
+        raise WeightsMissing(f"there are no weights called {name!r}; known: {', '.join(families)}")
     return WEIGHTS[name]
+
+
+def selected(names: Iterable[str]) -> tuple[str, ...]:
+    """Names of files, for names of files or of networks with several.
+
+    Raises:
+        WeightsMissing: There is none of that name; the message lists what there is.
+    """
+    found: list[str] = []
+    for name in names:
+        inside = [file for file in WEIGHTS if file.startswith(f"{name}/")]
+        found += inside or [known(name).name]
+    return tuple(dict.fromkeys(found))
+
+
+def folder_of(name: str) -> Path:
+    """Where the files of a network with several lie or would lie."""
+    return weights_folder() / name
+
+
+def require_all(names: Iterable[str]) -> dict[str, str]:
+    """Checksums of files, or of networks with several, all of them verified.
+
+    Raises:
+        WeightsMissing: Some are not on this machine; the message names the one command that fetches them all.
+        WeightsInvalid: A checksum is not the one that it should have.
+    """
+    names = list(names)
+    absent = [name for name in names if not all(path_of(file).is_file() for file in selected([name]))]
+    if absent:
+        raise WeightsMissing(
+            f"weights are not on this machine ({', '.join(absent)} in {weights_folder()}); fetch them with"
+            f" `vipectl models pull {' '.join(absent)}`"
+        )
+    return {file: require(file).sha256 for file in selected(names)}
 
 
 def path_of(name: str) -> Path:
