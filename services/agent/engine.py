@@ -6,10 +6,10 @@
 from __future__ import annotations
 
 import importlib
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol, cast
+from typing import TYPE_CHECKING, Any, Protocol, cast
 
 from services.domain.models import JobSpec, VideoRef, VideoResult
 from services.domain.states import VideoStatus
@@ -47,8 +47,11 @@ class Engine(Protocol):
         """
 
 
-EngineOpener = Callable[[str, str, str], Engine]
-"""(preset, camera model, device) -> engine. Raises VipeError where the combination cannot work at all."""
+EngineOpener = Callable[..., Engine]
+"""(preset, camera model, device) -> engine; called with `options`, a mapping, where a job changes the preset.
+
+Raises VipeError where the combination cannot work at all.
+"""
 
 
 class VipeEngine:
@@ -84,11 +87,13 @@ class VipeEngine:
         return index_row(annotation, video)
 
 
-def open_engine(preset: str, camera: str, device: str) -> Engine:
-    """Open the engine that ships. Imports the heavy libraries here and not in the agent."""
+def open_engine(preset: str, camera: str, device: str, options: Mapping[str, Any] | None = None) -> Engine:
+    """Open the engine that ships, with `JobSpec.preset_options`. Imports the heavy libraries here, not in the agent."""
     from vipe_core.pipeline.annotator import Annotator
+    from vipe_core.pipeline.presets import PresetOptions
 
-    return VipeEngine(Annotator(preset=preset, camera=camera, device=device))
+    changed = None if options is None else PresetOptions(**options)
+    return VipeEngine(Annotator(preset=preset, camera=camera, device=device, options=changed))
 
 
 def index_row(annotation: Annotation, video: VideoRef) -> VideoResult:

@@ -36,7 +36,7 @@ from services.agent.messages import (
 from services.agent.scratch import ShardScratch, sweep
 from services.agent.traffic import TrafficRecorder
 from services.domain.errors import InputUnavailable, ObjectMissing, ServiceError, StorageError
-from services.domain.models import VideoRef, VideoResult
+from services.domain.models import JobSpec, VideoRef, VideoResult
 from services.domain.redaction import redact
 from services.domain.states import VideoStatus
 from services.inputs.fetching import Fetched, fetched
@@ -82,7 +82,7 @@ class Slot:
 
     def __init__(self, config: SlotConfig) -> None:
         self._config = config
-        self._engines: dict[tuple[str, str], Engine] = {}
+        self._engines: dict[tuple[object, ...], Engine] = {}
         self._traffic = TrafficRecorder()
         self._cancel = threading.Event()
         self._progress = SlotProgress()
@@ -142,7 +142,7 @@ class Slot:
         started = time.perf_counter()
         self._progress = SlotProgress(video.key, "fetch")
         scratch = ShardScratch(self._config.scratch_dir, lease)
-        engine = self._engine(lease.spec.preset, lease.spec.camera)
+        engine = self._engine(lease.spec)
         with fetched(
             video,
             self._config.inputs,
@@ -193,14 +193,16 @@ class Slot:
             prepare_payload(task.lease, task.results, scratch.artifacts, scratch.tars, output, tar_name=task.tar_name)
         )
 
-    def _engine(self, preset: str, camera: str) -> Engine:
-        engine = self._engines.get((preset, camera))
+    def _engine(self, spec: JobSpec) -> Engine:
+        changed = {} if set(spec.preset_options.values()) == {None} else {"options": spec.preset_options}
+        key = (spec.preset, spec.camera, *spec.preset_options.values())
+        engine = self._engines.get(key)
         if engine is None:
             try:
-                engine = load_opener(self._config.engine)(preset, camera, self._config.device)
+                engine = load_opener(self._config.engine)(spec.preset, spec.camera, self._config.device, **changed)
             except VipeError as error:
                 raise _JobFailure(error) from error
-            self._engines = {(preset, camera): engine}  # One at a time: another preset's weights would stay in memory.
+            self._engines = {key: engine}  # One at a time: another preset's weights would stay in memory.
         return engine
 
     def _report(self, stage: str, frames_done: int, frames_total: int | None, share: float) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from functools import cache
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 from services.domain.errors import AddressRefused
 from services.domain.redaction import redact
@@ -32,6 +32,13 @@ def cameras() -> tuple[str, ...]:
     return CAMERAS
 
 
+@cache
+def metric_depths() -> tuple[str, ...]:
+    from vipe_core.pipeline.presets import METRIC_DEPTH
+
+    return METRIC_DEPTH
+
+
 def camera_of(preset: str) -> str:
     """The camera model that a preset takes where a job names none."""
     from vipe_core.pipeline.presets import resolve
@@ -43,6 +50,21 @@ def one_of(value: str, offered: tuple[str, ...]) -> str:
     if value not in offered:
         raise ValueError(f"{value!r} is not on offer; on offer: {', '.join(offered)}")
     return value
+
+
+def preset_options(preset: str, options: dict[str, Any]) -> None:
+    """Check what a job changes of a preset, as `JobSpec.preset_options` has it.
+
+    Raises:
+        ValueError: The engine does not take it.
+    """
+    from vipe_core.errors import ConfigError
+    from vipe_core.pipeline.presets import PresetOptions, resolve
+
+    try:
+        resolve(preset, options=PresetOptions(**options))
+    except ConfigError as error:
+        raise ValueError(str(error)) from error
 
 
 def known_length(value: str) -> str:

@@ -64,6 +64,21 @@ class JobRequest(ControlFields):
         "pixel of a frame shows. A video that does not show it fails with `scale_unobservable`.",
     )
 
+    phrases: list[Annotated[str, Field(max_length=64)]] | None = Field(
+        default=None,
+        max_length=64,
+        description="What is found in the videos, followed and masked, in plain words such as `person`; an empty list "
+        "for nothing. Default: the preset's own. Workers need the extra `hf` and the weights.",
+    )
+    detection_interval_s: float | None = Field(
+        default=None, gt=0, le=3600, description="Time between looks for new things. Default: the preset's own."
+    )
+    metric_depth: Annotated[str, AfterValidator(lambda v: offer.one_of(v, offer.metric_depths()))] | None = Field(
+        default=None,
+        max_length=64,
+        description="Network that tells the scale, such as `hf.depth_pro`, or `none`. Default: the preset's own.",
+    )
+
     @model_validator(mode="after")
     def _consistent(self) -> Self:
         if "://" in self.output and not self.output.startswith("s3://"):
@@ -74,7 +89,15 @@ class JobRequest(ControlFields):
             raise ValueError("output must not be one of the inputs")
         if "\x00" in self.name:
             raise ValueError("name must not hold NUL characters")
+        offer.preset_options(self.preset, self._options())
         return self
+
+    def _options(self) -> dict[str, Any]:
+        return {
+            "phrases": None if self.phrases is None else tuple(self.phrases),
+            "detection_interval_s": self.detection_interval_s,
+            "metric_depth": self.metric_depth,
+        }
 
     def to_spec(self) -> JobSpec:
         wanted = {"pose", "intrinsics", *self.attributes}
@@ -88,6 +111,7 @@ class JobRequest(ControlFields):
             shard_max_input_bytes=self.shard_max_input_bytes,
             name=self.name,
             scale_from=self.scale_from,
+            **self._options(),
         )
 
 
@@ -105,6 +129,9 @@ class SpecView(_View):
     shard_max_input_bytes: int
     name: str
     scale_from: str | None
+    phrases: list[str] | None
+    detection_interval_s: float | None
+    metric_depth: str | None
 
 
 class ProgressView(_View):

@@ -73,6 +73,15 @@ def submit(
         str | None,
         typer.Option(metavar="KNOWN", help="A known length of every video, as `vipectl annotate --scale-from`."),
     ] = None,
+    phrases: Annotated[
+        str | None, typer.Option(metavar="A,B,...", help="What to find and mask, as `vipectl annotate --phrases`.")
+    ] = None,
+    detection_interval: Annotated[
+        float | None, typer.Option(metavar="SECONDS", help="Time between looks for new things. Default: 2.")
+    ] = None,
+    metric_depth: Annotated[
+        str | None, typer.Option(metavar="NETWORK", help="What tells the scale, as `vipectl annotate --metric-depth`.")
+    ] = None,
     attributes: Annotated[
         str | None,
         typer.Option(metavar="A,B,...", help="Tars to write: depth,rgb,mask,confidence; the last only if named."),
@@ -106,6 +115,12 @@ def submit(
         spec["camera"] = camera
     if scale_from is not None:
         spec["scale_from"] = scale_from
+    if phrases is not None:
+        spec["phrases"] = [word.strip() for word in phrases.split(",") if word.strip()]
+    if detection_interval is not None:
+        spec["detection_interval_s"] = detection_interval
+    if metric_depth is not None:
+        spec["metric_depth"] = metric_depth
     if attributes is not None:
         spec["attributes"] = [name.strip() for name in attributes.split(",") if name.strip()]
     job = client.submit(spec, idempotency_key=key)

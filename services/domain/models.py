@@ -32,6 +32,9 @@ class JobSpec:
         name: Free text for humans.
         scale_from: A length that is known of every video of the job, which makes their scale metric, as `annotate`
             takes it.
+        phrases: What is found, followed and masked; None for what the preset does.
+        detection_interval_s: Time between looks for new things; None for the preset's own.
+        metric_depth: Network that tells the scale; None for the preset's own.
     """
 
     inputs: tuple[str, ...]
@@ -43,6 +46,9 @@ class JobSpec:
     shard_max_input_bytes: int = 1 << 30
     name: str = ""
     scale_from: str | None = None
+    phrases: tuple[str, ...] | None = None
+    detection_interval_s: float | None = None
+    metric_depth: str | None = None
 
     @property
     def config_hash(self) -> str:
@@ -50,14 +56,27 @@ class JobSpec:
         config: dict[str, Any] = {"preset": self.preset, "camera": self.camera, "attributes": list(self.attributes)}
         if self.scale_from is not None:
             config["scale_from"] = self.scale_from
+        config |= {name: value for name, value in self.preset_options.items() if value is not None}
         return hashlib.sha256(json.dumps(config, sort_keys=True).encode()).hexdigest()
+
+    @property
+    def preset_options(self) -> dict[str, Any]:
+        """What is changed of the preset; None where it is left as it is."""
+        return {
+            "phrases": self.phrases,
+            "detection_interval_s": self.detection_interval_s,
+            "metric_depth": self.metric_depth,
+        }
 
     def to_json(self) -> dict[str, Any]:
         return asdict(self)
 
     @classmethod
     def from_json(cls, data: dict[str, Any]) -> JobSpec:
-        return cls(**{**data, "inputs": tuple(data["inputs"]), "attributes": tuple(data["attributes"])})
+        several = {
+            name: tuple(data[name]) for name in ("inputs", "attributes", "phrases") if data.get(name) is not None
+        }
+        return cls(**{**data, **several})
 
 
 @dataclass(frozen=True, slots=True)
