@@ -38,7 +38,8 @@ class JobRequest(ControlFields):
         default="classical",
         max_length=64,
         description="Engine preset: `classical`, `classical_fast` with coarser dense depth for less time, `wide_angle` "
-        "for bent lenses; with the DROID network's weights on the workers, `vipe_fast`, or `pose_only` without depth.",
+        "for bent lenses; with the DROID network's weights on the workers, `vipe_fast`, or `pose_only` without depth; "
+        "with those of docs/models.md, `vipe`.",
     )
     camera: Annotated[str, AfterValidator(lambda v: offer.one_of(v, offer.cameras()))] | None = Field(
         default=None,

@@ -25,6 +25,9 @@ class TestCreate:
             shard_max_input_bytes=1000,
             name="Nächte",
             scale_from="height=1.6",
+            phrases=["red car"],
+            detection_interval_s=0.5,
+            metric_depth="hf.depth_pro",
         )
         answer = http.post("/v1/jobs", json=wanted)
         assert answer.status_code == 202
@@ -98,6 +101,9 @@ class TestCreate:
             ({"name": "x" * 201}, "body.name"),
             ({"scale_from": "height"}, "body.scale_from"),
             ({"scale_from": "height=-1"}, "body.scale_from"),
+            ({"metric_depth": "magic"}, "body.metric_depth"),
+            ({"detection_interval_s": 0}, "body.detection_interval_s"),
+            ({"phrases": ["x" * 65]}, "body.phrases.0"),
             ({"unknown": 1}, "body.unknown"),
         ],
     )

@@ -78,6 +78,10 @@ class RigAnnotator(Annotator):
         priors = self._priors()
         if priors.refiner is not None:
             raise ConfigError(f"the preset {self.preset.name} does not annotate rigs; classical and wide_angle do")
+        if self._masks is not None:
+            raise ConfigError(
+                "rigs are annotated without masks of what phrases name; choose a preset or options without"
+            )
         known_length = None if scale_from is None else KnownLength.parse(scale_from)
         beside = Path(rig).parent if isinstance(rig, (str, Path)) else None
         known = rig if isinstance(rig, Rig) else read_rig(rig)
@@ -124,7 +128,7 @@ class RigAnnotator(Annotator):
             depth_kind=depth_kind_of(camera),
             quality=dataclasses.replace(quality, scale_sigma_ratio=scaled.sigma_ratio),
             provenance=self._provenance(source, scaled),
-            dense=lambda: self._dense(source, scaled, timings, report),
+            dense=lambda: self._dense(source, scaled, None, timings, report),
             timings_s=timings,
         )
 
