@@ -63,3 +63,11 @@ def test_a_rig_that_names_no_video_wants_one_per_view(tmp_path: Path) -> None:
         RigAnnotator().annotate_rig(path)
     with pytest.raises(ConfigError, match="2 views, but 1 videos"):
         RigAnnotator().annotate_rig(replace(pair(), metric=False), [tmp_path / "left.mp4"])
+
+
+def test_a_view_with_measured_distortion_is_refused_by_name() -> None:
+    bent = Calibration(Camera("opencv", (*CAMERA.params, *[0.01] * 8), CAMERA.width, CAMERA.height))
+    left, right = pair().views
+    clip = ClipSource(np.zeros((2, CAMERA.height, CAMERA.width, 3), np.uint8))
+    with pytest.raises(ConfigError, match="view right: a rig takes pinhole and mei"):
+        RigAnnotator().annotate_rig(Rig((left, replace(right, calibration=bent))), [clip, clip])

@@ -151,6 +151,9 @@ def _given(view: RigView, source: FrameSource) -> Calibration | None:
     """The calibration of a view at the size of its video."""
     if view.calibration is None:
         return None
+    model = view.calibration.camera.model
+    if model not in ("pinhole", "mei"):
+        raise ConfigError(f"view {view.name}: a rig takes pinhole and mei cameras, not {model}; undistort its video")
     info = source.info
     return view.calibration.for_size(info.width, info.height, info.name)
 

@@ -243,6 +243,8 @@ class RigSlam:
             loops = examine_loops(reprojector, keyframes, graph, before, settings.neighbours)
             backend.sharpen()
             sigma = backend.rig_scale_sigma() if extent > 0 and not static else math.inf
+            # Nor do more measurements average away what is wrong with the cameras, or with the places that they have.
+            sigma = math.hypot(sigma, settings.lens_sigma, rig.place_sigma_ratio if rig.refine else 0.0)
             adjuster.alive = _nothing
             report("backend", 1, 1)
         found = examine(reprojector, keyframes, graph, adjuster.robust_scale_px)
