@@ -242,7 +242,10 @@ class RigSlam:
             backend.run()
             loops = examine_loops(reprojector, keyframes, graph, before, settings.neighbours)
             backend.sharpen()
-            sigma = backend.rig_scale_sigma() if extent > 0 and not static else math.inf
+            # Where no views overlap, an error in the rotation of one looks like another length of its lever arm.
+            overlap = any(i != j and keyframes.instant(i) == keyframes.instant(j) for i, j in graph)
+            told = extent > 0 and not static and (overlap or not rig.refine)
+            sigma = backend.rig_scale_sigma() if told else math.inf
             # Nor do more measurements average away what is wrong with the cameras, or with the places that they have.
             sigma = math.hypot(sigma, settings.lens_sigma, rig.place_sigma_ratio if rig.refine else 0.0)
             adjuster.alive = _nothing
