@@ -17,7 +17,7 @@ from torch import Tensor, nn
 
 from vipe_core.ba.problem import Grid
 from vipe_core.cameras import Camera
-from vipe_core.errors import ConfigError, EngineError, LibraryMissing, WeightsInvalid, WeightsMissing
+from vipe_core.errors import ConfigError, LibraryMissing, WeightsInvalid, WeightsMissing
 from vipe_core.priors.nvidia_vipe.completion import PriorDa
 from vipe_core.priors.nvidia_vipe.geocalib import GeoCalibInit
 from vipe_core.priors.nvidia_vipe.loading import filled, from_folder, part, tensors
@@ -56,8 +56,10 @@ def test_four_pictures_share_a_focal_length_and_one_tells_a_bent_lens() -> None:
         ((4, 3, 48, 64), {"shared_intrinsics": True}),
         ((1, 3, 48, 64), {"camera_model": "simple_mei"}),
     ]
-    with pytest.raises(EngineError, match="0 degrees"):
-        GeoCalibInit(GeoCalibDouble(0.0), "pinhole", CPU).estimate(frames, Grid(6, 8))
+    unsure = GeoCalibInit(GeoCalibDouble(0.0), "pinhole", CPU).estimate(frames, Grid(6, 8))
+    assert unsure.num_pairs == 0
+    assert unsure.log_focal_sigma > found.log_focal_sigma
+    assert 40 < unsure.camera.fov_x_deg < 70
 
 
 class Metric3dDouble:
@@ -194,6 +196,13 @@ def test_a_missing_package_names_what_installs_it() -> None:
     with pytest.raises(LibraryMissing, match=r"install it: pip install .*nvidia-vipe") as caught:
         part("geocalib.nothing_of_the_kind", "GeoCalib")
     assert caught.value.code == "library_missing"
+
+
+def test_what_the_package_wrote_for_cuda_is_refused_elsewhere(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"Metric3D .* on CUDA only, not on cpu"):
+        Metric3d.load(tmp_path / "none.pth", "small", CPU)
+    with pytest.raises(ConfigError, match=r"PriorDA .* on CUDA only"):
+        PriorDa.load(tmp_path, CPU)
 
 
 def test_weights_are_tensors_and_all_of_them(tmp_path: Path) -> None:

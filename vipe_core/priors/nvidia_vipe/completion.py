@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from vipe_core.cameras import Camera
 from vipe_core.errors import WeightsInvalid
-from vipe_core.priors.nvidia_vipe.loading import part, picture, tensors
+from vipe_core.priors.nvidia_vipe.loading import part, picture, require_cuda, tensors
 
 FROZEN, CONDITIONED = "depth_anything_v2_vitb.pth", "prior_depth_anything_vitb.pth"
 """Names that the package looks for in a folder."""
@@ -35,8 +35,10 @@ class PriorDa:
         """The network in a folder with the files `FROZEN` and `CONDITIONED`.
 
         Raises:
+            ConfigError: The device is not CUDA, for which its search for neighbours is written.
             LibraryMissing, WeightsMissing, WeightsInvalid: See `loading`.
         """
+        require_cuda("PriorDA", device)
         (kind,) = part("depth.priorda.priorda", "PriorDepthAnything")
         # The package reads the files itself, by torch's own reader, which does not unpickle unless it is told to.
         tensors(folder / FROZEN)

@@ -12,14 +12,14 @@ import torch
 
 from vipe_core.ba.problem import Grid
 from vipe_core.cameras import Camera
-from vipe_core.errors import EngineError
 from vipe_core.priors.nvidia_vipe.loading import part, picture, tensors
 from vipe_core.priors.protocols import IntrinsicsEstimate, WorkingFrame
 
 _PICTURES = 4
 # Published errors of the vertical field of view are some 3 to 5 degrees for half of the pictures.
 _LOG_FOCAL_SIGMA = 0.1
-_NARROWEST_RAD, _WIDEST_RAD = math.radians(5), math.radians(170)
+_NARROWEST_RAD, _WIDEST_RAD = math.radians(6), math.radians(170)
+_USUAL_RAD, _UNSURE_SIGMA = math.radians(45), 0.3
 
 
 class GeoCalibInit:
@@ -50,8 +50,7 @@ class GeoCalibInit:
     def estimate(self, frames: Sequence[WorkingFrame], grid: Grid) -> IntrinsicsEstimate:
         """See `IntrinsicsInit.estimate`. A bent lens is estimated from one picture, as the network can.
 
-        Raises:
-            EngineError: The network gives a field of view that no camera has.
+        Where the network gives a field of view that no camera has, a usual one is the start.
         """
         wanted = _PICTURES if self._camera == "pinhole" else 1
         chosen = np.unique(np.linspace(0, len(frames) - 1, min(wanted, len(frames))).round().astype(int))
@@ -62,10 +61,12 @@ class GeoCalibInit:
         else:
             found = self._model.calibrate(pictures, camera_model="simple_mei")["camera"]
         angle = float(found.vfov[0])
-        if not _NARROWEST_RAD < angle < _WIDEST_RAD:
-            raise EngineError(f"GeoCalib gave a vertical field of view of {math.degrees(angle):.0f} degrees")
+        sure = _NARROWEST_RAD < angle < _WIDEST_RAD
+        angle = angle if sure else _USUAL_RAD
         focal_px = height / (2 * math.tan(angle / 2))
         shape = () if self._camera == "pinhole" else (float(found.dist[0, 0]),)
         model: Any = self._camera
         camera = Camera(model, (focal_px, focal_px, width / 2, height / 2, *shape), width, height)
+        if not sure:
+            return IntrinsicsEstimate(camera, _UNSURE_SIGMA, 0)
         return IntrinsicsEstimate(camera, _LOG_FOCAL_SIGMA, len(chosen))

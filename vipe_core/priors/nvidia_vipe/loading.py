@@ -12,7 +12,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from vipe_core.errors import LibraryMissing, WeightsInvalid, WeightsMissing
+from vipe_core.errors import ConfigError, LibraryMissing, WeightsInvalid, WeightsMissing
 
 INSTALL = (
     "pip install 'vipe-cluster[nvidia-vipe]' && pip install --no-deps --no-build-isolation nvidia-vipe==1.2.0 (its"
@@ -33,6 +33,16 @@ def part(module: str, *names: str) -> tuple[Any, ...]:
         # Its extension is compiled as it is imported where it was not before, and that fails in every way there is.
         first_line = (str(error) or type(error).__name__).splitlines()[0][:200]
         raise LibraryMissing(f"{module} of nvidia-vipe cannot be used ({first_line}); install it: {INSTALL}") from error
+
+
+def require_cuda(network: str, device: torch.device) -> None:
+    """Refuse a device on which the package's code of a network cannot run.
+
+    Raises:
+        ConfigError: It is no CUDA device.
+    """
+    if device.type != "cuda":
+        raise ConfigError(f"{network} of nvidia-vipe runs on CUDA only, not on {device}; choose --device cuda")
 
 
 def tensors(path: Path, key: str | None = None) -> dict[str, Tensor]:

@@ -13,7 +13,7 @@ from vipe_core.annotation import DepthKind
 from vipe_core.cameras import Camera
 from vipe_core.errors import ConfigError
 from vipe_core.priors.hf.images import normalised, resized
-from vipe_core.priors.nvidia_vipe.loading import filled, from_folder, part, picture, tensors
+from vipe_core.priors.nvidia_vipe.loading import filled, from_folder, part, picture, require_cuda, tensors
 from vipe_core.priors.protocols import MetricEstimate
 
 # Published relative errors on scenes that were not trained on are some 5 to 15 %, most of them of the scale.
@@ -48,8 +48,10 @@ class Metric3d:
         """The network in a file.
 
         Raises:
+            ConfigError: The device is not CUDA, which its decoder names itself.
             LibraryMissing, WeightsMissing, WeightsInvalid: See `loading`.
         """
+        require_cuda("Metric3D", device)
         (build,) = part("depth.metric3d.model_fn", f"metric3d_vit_{which}")
         return cls(filled(build(pretrain=False), tensors(path, "model_state_dict"), path.name, device), device)
 
