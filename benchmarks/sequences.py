@@ -102,7 +102,7 @@ def find_sequence(name: str, data: Path = DATA) -> BenchSequence:
         return BenchSequence(name, paths.video, paths.truth, _LIMITS.get(name, Limit()))
     for folder in (data / "synthetic" / name, data / "real" / name, Path(name).resolve()):
         if (folder / "gt.npz").is_file():
-            choices = [folder / "video.mp4", *(folder / sub for sub in _PICTURES)]
+            choices = [folder / "video.mp4", *(folder / sub for sub in _PICTURES), *sorted(folder.glob("*.mp4"))]
             pictures = next((path for path in choices if path.exists()), None)
             return BenchSequence(folder.name, pictures, folder / "gt.npz", _LIMITS.get(folder.name, Limit()))
     raise MediaNotFound(f"{name}: neither a sample nor a folder with a gt.npz, here or in {data}")

@@ -38,14 +38,14 @@ class JobRequest(ControlFields):
         default="classical",
         max_length=64,
         description="Engine preset: `classical`, `classical_fast` with coarser dense depth for less time, `wide_angle` "
-        "for bent lenses; with the DROID network's weights on the workers, `vipe_fast`, or `pose_only` without depth; "
-        "with those of docs/models.md, `vipe`.",
+        "for bent lenses, `panorama` for 360-degree video; with the DROID network's weights on the workers, "
+        "`vipe_fast`, or `pose_only` without depth; with those of docs/models.md, `vipe`.",
     )
     camera: Annotated[str, AfterValidator(lambda v: offer.one_of(v, offer.cameras()))] | None = Field(
         default=None,
         max_length=64,
-        description="Camera model: `pinhole`, `mei` (wide angle), or `auto` for what each video says. Default: the "
-        "preset's own.",
+        description="Camera model: `pinhole`, `mei` (wide angle), `equirect` (360 degrees), or `auto` for what each "
+        "video says. Default: the preset's own.",
     )
     attributes: list[offer.OfferedAttribute] = Field(
         default_factory=lambda: list(DEFAULT_ATTRIBUTES),

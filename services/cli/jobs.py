@@ -61,12 +61,13 @@ def submit(
     preset: Annotated[
         str,
         typer.Option(
-            help="classical; classical_fast: coarser dense depth; wide_angle: a bent lens; vipe_fast, pose_only: by "
-            "the DROID network (vipectl models)."
+            help="classical; classical_fast: coarser dense depth; wide_angle: a bent lens; panorama: 360 degrees; "
+            "vipe_fast, pose_only: by the DROID network (vipectl models)."
         ),
     ] = "classical",
     camera: Annotated[
-        str | None, typer.Option(help="pinhole, mei (wide angle), or auto. Default: the preset's own.")
+        str | None,
+        typer.Option(help="pinhole, mei (wide angle), equirect (360 degrees), or auto. Default: the preset's own."),
     ] = None,
     name: str = "",
     scale_from: Annotated[

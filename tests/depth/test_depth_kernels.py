@@ -80,6 +80,7 @@ def cost_of(
             view.params,
             2,
             stride,
+            np.full(len(reference), stride),
             edge,
             1e-3,
         )

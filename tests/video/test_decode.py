@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from video_clips import number_of, picture, set_display_rotation, write_clip
+from video_clips import declare_panorama, number_of, picture, set_display_rotation, write_clip
 
 from vipe_core.errors import UnsupportedMedia
 from vipe_core.video import Limits, VideoFileSource, open_source, probe
@@ -258,3 +258,13 @@ def test_a_range_is_the_same_part_of_the_whole_in_every_container(tmp_path: Path
     assert len(whole) == 40
     assert [(f.index, f.timestamp_s) for f in part] == [(f.index, f.timestamp_s) for f in whole[26:39]]
     assert all(np.array_equal(a.rgb, b.rgb) for a, b in zip(part, whole[26:39], strict=True))
+
+
+def test_a_container_may_say_that_its_pictures_are_panoramas(tmp_path: Path) -> None:
+    path = write_clip(tmp_path / "round.mp4", num_frames=2)
+    assert not probe(path).spherical
+    declare_panorama(path)
+    assert probe(path).spherical
+    other = write_clip(tmp_path / "cube.mp4", num_frames=2)
+    declare_panorama(other, projection="cubemap")
+    assert not probe(other).spherical

@@ -86,3 +86,32 @@ def set_display_rotation(path: Path, clockwise_deg: int) -> None:
     matrix = (cos * one, sin * one, 0, -sin * one, cos * one, 0, 0, 0, 1 << 30)
     data[at + 40 : at + 76] = struct.pack(">9i", *matrix)
     path.write_bytes(data)
+
+
+_GOOGLE_SPHERICAL = bytes.fromhex("ffcc8263f8554a938814587a02521fdd")
+
+
+def declare_panorama(path: Path, projection: str = "equirectangular") -> None:
+    """Say in a finished mp4, in the way of Google's spherical video metadata (version 1), that it is a panorama."""
+    keys = {"Spherical": "true", "Stitched": "true", "StitchingSoftware": "none", "ProjectionType": projection}
+    xml = "".join(f"<GSpherical:{key}>{value}</GSpherical:{key}>" for key, value in keys.items())
+    namespace = 'xmlns:GSpherical="http://ns.google.com/videos/1.0/spherical/"'
+    payload = _GOOGLE_SPHERICAL + f"<rdf:SphericalVideo {namespace}>{xml}</rdf:SphericalVideo>".encode()
+    data = bytearray(path.read_bytes())
+    movie, movie_end = _box(data, b"moov", 0, len(data))
+    track, track_end = _box(data, b"trak", movie + 8, movie_end)
+    # The index lies behind the pictures, so that nothing it points to moves.
+    data[track_end:track_end] = struct.pack(">I4s", 8 + len(payload), b"uuid") + payload
+    for start, end in ((movie, movie_end), (track, track_end)):
+        data[start : start + 4] = struct.pack(">I", end - start + 8 + len(payload))
+    path.write_bytes(data)
+
+
+def _box(data: bytearray, kind: bytes, start: int, stop: int) -> tuple[int, int]:
+    """Where the first box of a kind begins and ends."""
+    while start < stop:
+        size, found = struct.unpack(">I4s", data[start : start + 8])
+        if found == kind:
+            return start, start + size
+        start += size
+    raise AssertionError(f"no box {kind!r}")

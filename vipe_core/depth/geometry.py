@@ -10,12 +10,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vipe_core.cameras import MODEL_CODE, Camera
+from vipe_core.depth.seam import Seam
 from vipe_core.depth.types import DepthSettings, SceneMap
 
 Array = NDArray[Any]
 
 _CONFIDENT = 0.3
 _MIN_SAMPLES = 40
+# Windows of a panorama widen towards the poles up to so many times; the last seven degrees show little anyway.
+_MAX_STRETCH = 8
 
 
 @dataclass(frozen=True)
@@ -26,20 +29,29 @@ class View:
         camera: At this resolution.
         model: Code of its model.
         params: (5,) float32 index parameters, padded with zeros.
-        rays: (h, w, 3) float32.
+        rays: (h, w, 3) float32; of a panorama beyond both ends of the picture, by its seam.
+        stretch: (h,) int64, how many pixels of a row are as wide as one is high; 1 but for a panorama.
     """
 
     camera: Camera
     model: int
     params: NDArray[np.float32]
     rays: NDArray[np.float32]
+    stretch: NDArray[np.int64]
 
     @classmethod
-    def of(cls, camera: Camera) -> View:
+    def of(cls, camera: Camera, seam: Seam | None = None) -> View:
         params = np.zeros(5, np.float32)
         index_params = camera.index_params()
         params[: len(index_params)] = index_params
-        return cls(camera, MODEL_CODE[camera.model], params, np.ascontiguousarray(camera.rays(), np.float32))
+        rays = camera.rays().astype(np.float32)
+        if seam is not None:
+            rays = seam.around(rays)
+        stretch = np.ones(camera.height, np.int64)
+        if camera.model == "equirect":
+            beside_pole = np.sin((np.arange(camera.height) + 0.5) / camera.height * np.pi)
+            stretch = np.clip(np.rint(1 / beside_pole), 1, _MAX_STRETCH).astype(np.int64)
+        return cls(camera, MODEL_CODE[camera.model], params, np.ascontiguousarray(rays), stretch)
 
 
 def relative(world_from_cam: Array, source: int, target: int) -> NDArray[np.float64]:
@@ -81,6 +93,7 @@ class KeyframePrior:
         height, width = scene.inverse_depth.shape[1:]
         self._camera = scene.camera.resized(width, height)
         self._rays = self._camera.rays()
+        self._seam = Seam(scene.camera)
         values: Array = scene.inverse_depth[(scene.confidence > _CONFIDENT) & (scene.inverse_depth > 0)]
         if not len(values):
             values = scene.inverse_depth[np.isfinite(scene.inverse_depth) & (scene.inverse_depth > 0)]
@@ -125,6 +138,8 @@ class KeyframePrior:
         points = self._rays @ motion[:3, :3].T + d[..., None] * motion[:3, 3]
         px, imaged = self._camera.project(points)
         col, row = np.rint(px[..., 0]), np.rint(px[..., 1])
+        if self._seam.closed:
+            col %= width
         kept = imaged & (col >= 0) & (row >= 0) & (col < width) & (row < height)
         kept &= (scene.confidence[k] > 0) & (d > 0) & np.isfinite(d)
         length = length_of(self._camera, points)
@@ -137,9 +152,10 @@ class KeyframePrior:
         low, high = _padded_range(confident) if len(confident) >= _MIN_SAMPLES else self._range
         weight = trust.astype(np.float32)
         filled: Array = np.full(value.shape, self.median, np.float32)
+        around, product = self._seam.around(weight), self._seam.around((weight * value).astype(np.float32))
         for sigma in (12.0, 3.0, 1.0):
-            total = cv2.GaussianBlur(weight, (0, 0), sigma)
-            blurred = cv2.GaussianBlur((weight * value).astype(np.float32), (0, 0), sigma)
+            total = self._seam.joined(cv2.GaussianBlur(around, (0, 0), sigma))
+            blurred = self._seam.joined(cv2.GaussianBlur(product, (0, 0), sigma))
             filled = np.where(total > 0.02, blurred / np.maximum(total, 1e-6), filled)
         known = trust > 0
         return Prior(
@@ -168,6 +184,8 @@ def choose_sources(scene: SceneMap, view: View, prior: Prior, frame: int, settin
     camera = view.camera
     rows = np.linspace(0.08, 0.92, 7) * (camera.height - 1)
     cols = np.linspace(0.08, 0.92, 9) * (camera.width - 1)
+    if camera.model == "equirect":
+        cols = (np.arange(8) + 0.5) / 8 * camera.width - 0.5
     px = np.stack(np.meshgrid(cols, rows), axis=-1).reshape(-1, 2)
     rays = camera.unproject(px)
     cell_rows = np.clip((px[:, 1] * prior.inverse_depth.shape[0] / camera.height).astype(int), 0, None)
@@ -177,9 +195,16 @@ def choose_sources(scene: SceneMap, view: View, prior: Prior, frame: int, settin
     turned = np.einsum("nij,pj->npi", motion[:, :3, :3], rays)
     seen, imaged = camera.project(turned + d[None, :, None] * motion[:, None, :3, 3])
     unmoved, _ = camera.project(turned)
-    inside = imaged & (seen >= 0).all(-1) & (seen <= (camera.width - 1, camera.height - 1)).all(-1)
+    if camera.model == "equirect":
+        # Everything is in view. Pixels count as they do at the horizon: near the poles they are many for a small angle.
+        inside = imaged
+        along = camera.unproject(seen)
+        angle = np.arctan2(np.linalg.norm(np.cross(along, turned), axis=-1), (along * turned).sum(-1))
+        shift = angle * (camera.width / (2 * np.pi))
+    else:
+        inside = imaged & (seen >= 0).all(-1) & (seen <= (camera.width - 1, camera.height - 1)).all(-1)
+        shift = np.where(inside, np.linalg.norm(seen - unmoved, axis=-1), 0.0)
     overlap = inside.mean(axis=1)
-    shift = np.where(inside, np.linalg.norm(seen - unmoved, axis=-1), 0.0)
     # Median over the points inside: they sort to the end, behind the zeros of the others.
     shift.sort(axis=1)
     middle = shift.shape[1] - 1 - inside.sum(axis=1) // 2

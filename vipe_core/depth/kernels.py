@@ -72,6 +72,55 @@ def _warp_pinhole(
             warped[y, x] = missing
 
 
+@vectorised
+def _angle(y: Any, x: Any) -> Any:
+    """`atan2` in float32 without a call, to 1e-5 radians, a thousandth of a pixel: an odd polynomial for the arc
+    tangent (minimax on 0..1), unfolded to the full circle."""
+    pi, half_pi = np.float32(math.pi), np.float32(math.pi / 2)
+    wide, high = abs(x), abs(y)
+    large, small = (wide, high) if wide > high else (high, wide)
+    t = small / (large + np.float32(1e-30))
+    q = t * t
+    r = np.float32(0.05265332) - q * np.float32(0.01172120)
+    r = np.float32(0.19354346) - q * (np.float32(0.11643287) - q * r)
+    r = t * (np.float32(0.99997726) - q * (np.float32(0.33262347) - q * r))
+    r = half_pi - r if high > wide else r
+    r = pi - r if x < 0 else r
+    return -r if y < 0 else r
+
+
+@vectorised
+def _warp_around(
+    image: Array, turned: Array, t: Array, base: Array, step: Array, offset: float, params: Array, warped: Array
+) -> None:
+    """`_warp_pinhole` for a panorama, which sees everything; `base` may be wider than it."""
+    h, w = base.shape
+    rows, columns = image.shape
+    zero, half, one = np.float32(0), np.float32(0.5), np.float32(1)
+    per_turn, per_half_turn = params[0] / np.float32(2 * math.pi), params[1] / np.float32(math.pi)
+    # Coordinates are kept positive, so that cutting them off rounds them down.
+    middle = half * params[0] + half
+    tx, ty, tz = t[0], t[1], t[2]
+    across, down = np.empty(w, np.float32), np.empty(w, np.float32)
+    for y in range(h):
+        for x in range(w):
+            d = base[y, x] + offset * step[y, x]
+            d = d if d > zero else zero
+            a, b, c = turned[y, x, 0] + tx * d, turned[y, x, 1] + ty * d, turned[y, x, 2] + tz * d
+            across[x] = _angle(a, c) * per_turn + middle
+            down[x] = _angle(np.float32(math.sqrt(a * a + c * c)), -b) * per_half_turn + half
+        for x in range(w):
+            ui, vi = np.int32(across[x]), np.int32(down[x])
+            fu, fv = across[x] - np.float32(ui), down[x] - np.float32(vi)
+            left = ui - 1 if ui > 0 else columns - 1
+            right = ui if ui < columns else 0
+            upper = vi - 1 if vi > 0 else 0
+            lower = vi if vi < rows else rows - 1
+            above = image[upper, left] + fu * (image[upper, right] - image[upper, left])
+            below = image[lower, left] + fu * (image[lower, right] - image[lower, left])
+            warped[y, x] = above + min(one, fv) * (below - above)
+
+
 @compiled
 def _warp(
     image: Array,
@@ -84,7 +133,7 @@ def _warp(
     params: Array,
     warped: Array,
 ) -> None:
-    """`_warp_pinhole` for any camera model."""
+    """`_warp_pinhole` for the unified model."""
     h, w = base.shape
     for y in range(h):
         for x in range(w):
@@ -103,7 +152,7 @@ def _warp(
 
 
 @vectorised
-def _supports(image: Array, radius: int, stride: int, edge: float) -> tuple[Array, Array, Array]:
+def _supports(image: Array, radius: int, stride: int, across: Array, edge: float) -> tuple[Array, Array, Array]:
     """Adaptive support windows (Yoon and Kweon, PAMI 2006): pixels that look like the centre count most.
 
     A window does not reach over the edge of a thing onto what is behind it, so that neither takes the other's depth.
@@ -123,7 +172,7 @@ def _supports(image: Array, radius: int, stride: int, edge: float) -> tuple[Arra
         for x in range(w):
             total, mean, squares = 0.0, 0.0, 0.0
             for i in range(side * side):
-                v, u = y + stride * (i // side) - reach, x + stride * (i % side) - reach
+                v, u = y + stride * (i // side) - reach, x + across[y] * (i % side - side // 2)
                 if v < 0 or u < 0 or v >= h or u >= w:
                     continue
                 weight = math.exp(-abs(image[v, u] - image[y, x]) / edge)
@@ -133,7 +182,7 @@ def _supports(image: Array, radius: int, stride: int, edge: float) -> tuple[Arra
                 squares += weight * image[v, u] * image[v, u]
             mean /= total
             for i in range(side * side):
-                v, u = y + stride * (i // side) - reach, x + stride * (i % side) - reach
+                v, u = y + stride * (i // side) - reach, x + across[y] * (i % side - side // 2)
                 if v < 0 or u < 0 or v >= h or u >= w:
                     continue
                 weights[i, y, x] /= total
@@ -152,19 +201,21 @@ def _correlate(
     warped: Array,
     radius: int,
     stride: int,
+    across: Array,
+    margin: int,
     noise: float,
     first: Array,
     second: Array,
     count: Array,
 ) -> None:
-    """Correlation of all windows with the warped pictures (D, h + 2 radius, w + 2 radius) of one source.
+    """Correlation of all windows with the warped pictures (D, h + 2 radius, w + 2 margin) of one source.
 
     Keeps the best two scores (D, h, w) and counts the sources. The inner loops have no branches, so that the compiler
     can vectorise them; what is not seen is NaN and makes the sums of its window NaN.
     """
     num_planes, h, w = first.shape
     side = 2 * (radius // stride) + 1
-    start = radius - stride * (radius // stride)
+    start, left = radius - stride * (radius // stride), margin - side // 2 * across
     sums = np.empty((3, w), np.float32)
     floor, outside = np.float32(noise), np.float32(-2)
     for y in range(h):
@@ -172,7 +223,7 @@ def _correlate(
             sums[:] = 0
             for i in range(side * side):
                 line = warped[k, y + start + stride * (i // side)]
-                shift = start + stride * (i % side)
+                shift = left[y] + across[y] * (i % side)
                 share, product = weights[i, y], products[i, y]
                 for x in range(w):
                     j = line[x + shift]
@@ -206,6 +257,7 @@ def sweep_cost(
     params: Array,
     radius: int,
     stride: int,
+    across: Array,
     edge: float,
     noise: float,
 ) -> Array:
@@ -220,13 +272,16 @@ def sweep_cost(
         rays: (h, w, 3) float32 rays of its pixels.
         base, step: (h, w) float32.
         offsets: (D,) float32.
-        sources: (S, h, w) float32 gray images of the same camera, NaN on pixels that must not be used.
+        sources: (S, h, w) float32 gray images of the same camera, NaN on pixels that must not be used. Those of a
+            panorama are as wide as it is, also where the reference goes on beyond its ends.
         rotations: (S, 3, 3) float32 source_from_reference.
         translations: (S, 3) float32.
         model: Code of the camera model.
         params: (5,) float32 index parameters at this resolution.
         radius: Half side of the window.
-        stride: Distance of the pixels of a window that count.
+        stride: Distance between the rows of a window that count.
+        across: (h,) int64 distance between the pixels of such a row, by the row of the window's centre: a panorama is
+            stretched towards its poles.
         edge: Grey-level difference to the centre that lowers the weight of a pixel by a factor e.
         noise: Variance that is added to both windows'.
 
@@ -237,13 +292,14 @@ def sweep_cost(
     num_planes, num_sources = len(offsets), len(sources)
     # Grey levels around zero keep the products small for float32.
     level = np.float32(reference.mean())
-    weights, products, statistics = _supports(reference - level, radius, stride, edge)
+    weights, products, statistics = _supports(reference - level, radius, stride, across, edge)
     gain = (1 / np.sqrt(statistics[1] + np.float32(noise))).astype(np.float32)
     first = np.full((num_planes, h, w), np.float32(-2), np.float32)
     second = np.full((num_planes, h, w), np.float32(-2), np.float32)
     count = np.zeros((num_planes, h, w), np.uint8)
     turned = np.empty((h, w, 3), np.float32)
-    warped = np.zeros((num_planes, h + 2 * radius, w + 2 * radius), np.float32)
+    margin = radius // stride * across.max()
+    warped = np.zeros((num_planes, h + 2 * radius, w + 2 * margin), np.float32)
     for s in range(num_sources):
         r, t, image = rotations[s], translations[s], sources[s] - level
         for y in range(h):
@@ -251,12 +307,16 @@ def sweep_cost(
                 for c in range(3):
                     turned[y, x, c] = r[c, 0] * rays[y, x, 0] + r[c, 1] * rays[y, x, 1] + r[c, 2] * rays[y, x, 2]
         for k in range(num_planes):
-            inner = warped[k, radius : radius + h, radius : radius + w]
+            inner = warped[k, radius : radius + h, margin : margin + w]
             if model == 0:
                 _warp_pinhole(image, turned, t, base, step, offsets[k], params, inner)
+            elif model == 2:
+                _warp_around(image, turned, t, base, step, offsets[k], params, inner)
             else:
                 _warp(image, turned, t, base, step, offsets[k], model, params, inner)
-        _correlate(weights, products, statistics[0], gain, warped, radius, stride, noise, first, second, count)
+        _correlate(
+            weights, products, statistics[0], gain, warped, radius, stride, across, margin, noise, first, second, count
+        )
     cost = np.empty((h, w, num_planes), np.float32)
     half, zero = np.float32(0.5), np.float32(0)
     for y in range(h):
@@ -290,11 +350,12 @@ def check(
 ) -> None:
     """Where another frame's depth map confirms this one; adds to the last four arrays (h, w) in place.
 
-    A pixel that lands in the other picture is asked there. It is confirmed where the inverse depths differ by no more
-    than `tolerance` of the predicted one plus `slack`: one vote, and the ratio of the two. It is hidden where the other
-    frame sees something nearer, which is no contradiction.
+    A pixel that lands in the other picture (h', w') is asked there. It is confirmed where the inverse depths differ by
+    no more than `tolerance` of the predicted one plus `slack`: one vote, and the ratio of the two. It is hidden where
+    the other frame sees something nearer, which is no contradiction.
     """
     h, w = inverse_depth.shape
+    rows, columns = other.shape
     for y in range(h):
         for x in range(w):
             d = inverse_depth[y, x]
@@ -307,7 +368,9 @@ def check(
                 rotation[2, 0] * a + rotation[2, 1] * b + rotation[2, 2] * c + translation[2] * d,
             )
             ui, vi = math.floor(u + 0.5), math.floor(v + 0.5)
-            if length <= 0 or ui < 0 or vi < 0 or ui >= w or vi >= h:
+            if model == 2 and ui == columns:
+                ui = 0
+            if length <= 0 or ui < 0 or vi < 0 or ui >= columns or vi >= rows:
                 continue
             predicted = max(d / length, 1e-12)
             nearer = other[vi, ui] - predicted

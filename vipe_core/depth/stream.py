@@ -22,6 +22,7 @@ from vipe_core.depth.completion import complete
 from vipe_core.depth.consistency import Confirmed, confirm
 from vipe_core.depth.geometry import KeyframePrior, Prior, choose_sources, relative
 from vipe_core.depth.moving import stand
+from vipe_core.depth.seam import Seam
 from vipe_core.depth.sky import find_sky
 from vipe_core.depth.sweep import PlaneSweep, RawDepth
 from vipe_core.depth.types import FILLED, MEASURED, MOVING, SKY, UNOBSERVED, DepthFrame, DepthSettings, SceneMap
@@ -63,6 +64,10 @@ class _Picture:
     gray: NDArray[np.uint8]
     moving: NDArray[np.bool_]
     unusable: NDArray[np.bool_]
+
+    def around(self, seam: Seam) -> _Picture:
+        moving, unusable = seam.around(self.moving), seam.around(self.unusable)
+        return _Picture(seam.around(self.rgb), seam.around(self.gray), moving, unusable)
 
 
 class DenseDepth:
@@ -119,11 +124,11 @@ class DenseDepth:
         sweep: PlaneSweep,
     ) -> DepthFrame:
         """Confirms, fuses, fills and enlarges the depth of one frame."""
-        settings, raw = self._settings, raws[index]
-        gray = picture.gray.astype(np.float32)
-        size = gray.shape[::-1]
-        prior_value = cv2.resize(prior.inverse_depth, size, interpolation=cv2.INTER_LINEAR)
-        prior_trust = cv2.resize(prior.confidence, size, interpolation=cv2.INTER_LINEAR)
+        settings, seam = self._settings, sweep.seam
+        raw, picture = raws[index].around(seam), picture.around(seam)
+        size = picture.gray.shape[::-1]
+        prior_value = cv2.resize(seam.around(prior.inverse_depth), size, interpolation=cv2.INTER_LINEAR)
+        prior_trust = cv2.resize(seam.around(prior.confidence), size, interpolation=cv2.INTER_LINEAR)
         if raw.measured:
             start, stop = scene.shot_of(index)
             others = [
@@ -141,8 +146,10 @@ class DenseDepth:
         kind = np.where(moving, MOVING, kind).astype(np.uint8)
         confidence = np.where(moving, 0, confidence).astype(np.float32)
         value = np.clip(value, _FAR_LIMIT * prior.low, _NEAR_LIMIT * prior.high).astype(np.float32)
+        value, confidence, kind = seam.joined(value), seam.joined(confidence), seam.inside(kind)
+        gray = seam.inside(picture.gray).astype(np.float32)
         full_gray = cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY)
-        depth, sure = upsample(value, confidence, gray, full_gray, _EDGE, _SAME)
+        depth, sure = upsample(value, confidence, gray, full_gray, _EDGE, _SAME, seam.closed)
         kind = np.asarray(cv2.resize(kind, full_gray.shape[::-1], interpolation=cv2.INTER_NEAREST), np.uint8)
         masked = kind == MOVING
         if frame.masked is not None:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from vipe_core.depth.aggregation import add_prior, aggregate, winner
 from vipe_core.depth.geometry import Prior, View, relative
 from vipe_core.depth.kernels import sweep_cost
+from vipe_core.depth.seam import Seam
 from vipe_core.depth.types import DepthSettings, SceneMap
 from vipe_core.depth.upsampling import upsample
 
@@ -48,6 +49,10 @@ class RawDepth:
     margin: NDArray[np.float32]
     measured: bool
 
+    def around(self, seam: Seam) -> RawDepth:
+        value, score, margin = (seam.around(part) for part in (self.inverse_depth, self.score, self.margin))
+        return RawDepth(value, score, margin, self.measured)
+
 
 class PlaneSweep:
     """Coarse-to-fine sweep for one camera."""
@@ -56,8 +61,9 @@ class PlaneSweep:
         self._scene = scene
         self._settings = settings
         width, height = scene.camera.width, scene.camera.height
-        self.coarse = View.of(scene.camera.resized(width // 4, height // 4))
-        self.fine = View.of(scene.camera.resized(width // 2, height // 2))
+        self.seam = Seam(scene.camera)
+        self.coarse = View.of(scene.camera.resized(width // 4, height // 4), self.seam)
+        self.fine = View.of(scene.camera.resized(width // 2, height // 2), self.seam)
 
     def depth(
         self, frame: int, half: Array, sources: dict[int, tuple[NDArray[np.uint8], NDArray[np.bool_]]], prior: Prior
@@ -70,12 +76,14 @@ class PlaneSweep:
             sources: Frame index -> gray at the same size, and where it must not be used.
             prior: What bundle adjustment says about this frame.
         """
-        height, width = half.shape
         if not sources:
+            width, height = half.shape[::-1]
             start = cv2.resize(prior.inverse_depth, (width, height), interpolation=cv2.INTER_LINEAR)
             nothing = np.zeros_like(half, np.float32)
             return RawDepth(np.asarray(start, np.float32), nothing, nothing, False)
-        settings = self._settings
+        settings, seam = self._settings, self.seam
+        half, inverse_depth = seam.around(half), seam.around(prior.inverse_depth)
+        height, width = half.shape
         motion = [relative(self._scene.world_from_cam, frame, j) for j in sources]
         rotations = np.array([m[:3, :3] for m in motion], np.float32)
         translations = np.array([m[:3, 3] for m in motion], np.float32)
@@ -95,6 +103,7 @@ class PlaneSweep:
                     view.params,
                     r,
                     settings.support_stride,
+                    settings.support_stride * view.stretch,
                     settings.support_edge,
                     settings.noise,
                 )
@@ -104,12 +113,12 @@ class PlaneSweep:
         gray = _quarter(half)
         planes = hypotheses(prior.low, prior.high, settings.planes)
         images = np.stack([_usable(image, masked) for image, masked in sources.values()])
-        small = np.stack([cv2.resize(image, size, interpolation=cv2.INTER_AREA) for image in images])
+        small = np.stack([_quarter(image) for image in images])
         cost = cost_of(
             self.coarse, gray, np.zeros_like(gray), np.ones_like(gray), planes, small, settings.coarse_radius
         )
-        guess = cv2.resize(prior.inverse_depth, size, interpolation=cv2.INTER_LINEAR)
-        trust = cv2.resize(prior.confidence, size, interpolation=cv2.INTER_LINEAR)
+        guess = cv2.resize(inverse_depth, size, interpolation=cv2.INTER_LINEAR)
+        trust = cv2.resize(seam.around(prior.confidence), size, interpolation=cv2.INTER_LINEAR)
         matching = cost.copy()
         numbers = np.arange(len(planes), dtype=np.float32)
         position = np.interp(guess, planes, numbers).astype(np.float32)
@@ -135,7 +144,7 @@ class PlaneSweep:
         # The nearest of all hypotheses wins where none is right.
         at_end = (plane > len(planes) - 2).astype(np.uint8)
         score[cv2.resize(at_end, (width, height), interpolation=cv2.INTER_NEAREST) > 0] = 0
-        return RawDepth(found, score, np.asarray(sure, np.float32), True)
+        return RawDepth(seam.joined(found), seam.inside(score), seam.inside(np.asarray(sure, np.float32)), True)
 
     def _aggregated(self, cost: Array, gray: Array) -> Array:
         s = self._settings

@@ -15,7 +15,13 @@ Array = NDArray[Any]
 
 @compiled
 def upsample(
-    inverse_depth: Array, confidence: Array, gray: Array, full_gray: Array, edge: float, same: float
+    inverse_depth: Array,
+    confidence: Array,
+    gray: Array,
+    full_gray: Array,
+    edge: float,
+    same: float,
+    closed: bool = False,
 ) -> tuple[Array, Array]:
     """Depth (not inverse) and confidence at the size of `full_gray`, following its edges.
 
@@ -27,6 +33,7 @@ def upsample(
         full_gray: (H, W) uint8.
         edge: Grey-level difference that lowers a weight by a factor e.
         same: Relative difference in inverse depth within which two samples are one surface.
+        closed: Whether the left and the right border are one place.
     """
     h, w = inverse_depth.shape
     rows, cols = full_gray.shape
@@ -46,7 +53,8 @@ def upsample(
             heaviest = 0
             for i in range(4):
                 yy = min(max(v0 + i // 2, 0), h - 1)
-                xx = min(max(u0 + i % 2, 0), w - 1)
+                xx = u0 + i % 2
+                xx = xx % w if closed else min(max(xx, 0), w - 1)
                 near = (fv if i // 2 else 1 - fv) * (fu if i % 2 else 1 - fu) + 1e-3
                 difference = abs(np.float32(full_gray[y, x]) - gray[yy, xx])
                 weight[i] = near * decay[min(255, int(difference))]

@@ -26,15 +26,17 @@ from vipe_core.depth.known import KnownLength
 from vipe_core.depth.scene import scene_of
 from vipe_core.depth.stream import DenseDepth
 from vipe_core.depth.without import NoDepth
-from vipe_core.errors import EngineError, VipeError
+from vipe_core.errors import ConfigError, EngineError, VipeError
 from vipe_core.pipeline.device import describe_device, resolve_device, set_threads
 from vipe_core.pipeline.masking import find_instances
 from vipe_core.pipeline.presets import Preset, PresetOptions, resolve
 from vipe_core.pipeline.provenance import engine_version, library_versions
 from vipe_core.pipeline.providers import open_depth, open_masks, open_priors, require_libraries
 from vipe_core.pipeline.scaling import ScaledScene, set_scale
+from vipe_core.priors.classical.panoramic import looks_panoramic
 from vipe_core.priors.weights import require_all
 from vipe_core.quality import assess
+from vipe_core.slam.panorama import PanoramaSlam
 from vipe_core.slam.system import Slam
 from vipe_core.video import MaskedView, open_source
 from vipe_core.video.instances import InstanceMaps, InstanceView
@@ -42,13 +44,17 @@ from vipe_core.video.source import FrameSource
 
 logger = logging.getLogger(__name__)
 
+# First frames of a video that must all look like panoramas for it to be one.
+_PICTURES_LOOKED_AT = 3
+
 
 class Annotator:
     """An engine that is ready to annotate videos one after the other.
 
     Args:
         preset: Name of a preset, or a `Preset` of one's own.
-        camera: Camera model to estimate, `pinhole`, `mei` (wide angle) or `auto`; the preset's own if None.
+        camera: Camera model to estimate, `pinhole`, `mei` (wide angle) or `auto`, or `equirect` for panoramas; the
+            preset's own if None.
         device: `cpu`, `cuda` or `cuda:N`: where bundle adjustment and networks run.
         threads: CPU threads of torch and OpenCV in this process. The result depends on it in the last digits; one is
             the choice that gives the same bytes everywhere, and the most videos per hour of a machine.
@@ -120,9 +126,8 @@ class Annotator:
             source = InstanceView(source, instances)
         masks_s = time.perf_counter() - masks_start_s
 
-        slam = Slam(self._priors(), self.preset.slam, self.device)
         with typed_errors(source, report), torch.inference_mode():
-            result = slam.run(source, report)
+            result = self._slam(self._model(source)).run(source, report)
             quality = assess(result, self.preset.slam, source.info.width)
             scaled = set_scale(scene_of(result), source, known, self._depth.metric, report)
             quality = dataclasses.replace(quality, scale_sigma_ratio=scaled.sigma_ratio)
@@ -152,6 +157,23 @@ class Annotator:
             timings_s=timings,
             mask_phrases=dict(MASK_PHRASES) if instances is None else instances.phrases,
         )
+
+    def _model(self, source: FrameSource) -> str:
+        """The camera model to estimate: that of the preset; where it is left open, panoramas are told apart here."""
+        if self.preset.camera != "auto":
+            return self.preset.camera
+        if source.info.spherical:
+            return "equirect"
+        with closing(source.frames(stop=_PICTURES_LOOKED_AT)) as frames:
+            return "equirect" if looks_panoramic([frame.rgb for frame in frames]) else "auto"
+
+    def _slam(self, model: str) -> Slam | PanoramaSlam:
+        priors = self._priors()
+        if model != "equirect":
+            return Slam(priors, self.preset.slam, self.device)
+        if priors.refiner is not None:
+            raise ConfigError(f"the preset {self.preset.name} does not annotate panoramas; panorama and classical do")
+        return PanoramaSlam(priors, self.preset.slam, self.device)
 
     def _provenance(self, source: FrameSource, scaled: ScaledScene) -> Provenance:
         if isinstance(source, InstanceView):

@@ -13,7 +13,7 @@ from vipe_core.errors import ConfigError
 from vipe_core.priors.instances import InstanceSettings
 from vipe_core.slam.settings import EnergyTerms, SlamSettings
 
-CAMERAS = ("pinhole", "mei", "auto")
+CAMERAS = ("pinhole", "mei", "auto", "equirect")
 NONE = "none"
 """The provider of a role that nobody fills: no tracks, no dense depth, no metric depth, no masks."""
 
@@ -53,7 +53,7 @@ class Preset:
 
     Attributes:
         name: Name that users choose it by.
-        camera: Camera model that is estimated; `auto` for what the video says.
+        camera: Camera model that is estimated; `auto` for what the video says, `equirect` has nothing to estimate.
         matcher: Provider of dense matching.
         sparse: Provider of sparse tracks.
         intrinsics: Provider of the initial camera.
@@ -169,6 +169,7 @@ _PRESETS = {
         _CLASSICAL,
         dataclasses.replace(_CLASSICAL, name="classical_fast", dense_depth=DepthSettings.fast()),
         dataclasses.replace(_CLASSICAL, name="wide_angle", camera="mei"),
+        dataclasses.replace(_CLASSICAL, name="panorama", camera="equirect"),
         dataclasses.replace(_NETWORK, name="vipe_fast"),
         dataclasses.replace(_NETWORK, name="pose_only", depth=NONE),
         dataclasses.replace(
@@ -185,14 +186,16 @@ _INTRINSICS = {
     "pinhole": "classical.two_view_focal",
     "mei": "classical.unified_sweep",
     "auto": "classical.unified_sweep",
+    "equirect": "classical.cube_faces",
 }
 
 PRESETS = tuple(_PRESETS)
 """Names, the default first. `classical_fast` has the same poses and map, and coarser dense depth for less time;
-`wide_angle` estimates the bend of the lens as well. `vipe_fast` and `pose_only` find poses as the paper does, by the
-DROID network and bundle adjustment in turns, and need its weights; the one has coarse dense depth, the other none.
-`vipe` is the paper's whole: masks of what its phrases name, the camera from GeoCalib, metric depth, and video depth
-aligned to the map; it needs the extras `hf` and `nvidia-vipe`, and their weights."""
+`wide_angle` estimates the bend of the lens as well; `panorama` is for equirectangular video. `vipe_fast` and
+`pose_only` find poses as the paper does, by the DROID network and bundle adjustment in turns, and need its weights; the
+one has coarse dense depth, the other none. `vipe` is the paper's whole: masks of what its phrases name, the camera from
+GeoCalib, metric depth, and video depth aligned to the map; it needs the extras `hf` and `nvidia-vipe`, and their
+weights."""
 
 
 def resolve(preset: str | Preset, camera: str | None = None, options: PresetOptions | None = None) -> Preset:

@@ -76,7 +76,7 @@ class RigAnnotator(Annotator):
             EngineError: A stage failed, a defect of ours.
         """
         priors = self._priors()
-        if priors.refiner is not None:
+        if priors.refiner is not None or self.preset.camera == "equirect":
             raise ConfigError(f"the preset {self.preset.name} does not annotate rigs; classical and wide_angle do")
         if self._masks is not None:
             raise ConfigError(

@@ -50,6 +50,8 @@ def assess(result: SlamResult, settings: SlamSettings, source_width: int) -> Qua
         source_width: Width of the source video; residuals are reported in its pixels.
     """
     found = result.map
+    # Its lens is no question, and it is as sharp as pictures a quarter as wide.
+    panorama = result.camera.model == "equirect"
     reasons: list[str] = []
     fatal = False
     if len(result.timestamps_s) < _MIN_FRAMES:
@@ -66,7 +68,8 @@ def assess(result: SlamResult, settings: SlamSettings, source_width: int) -> Qua
         if found.coverage < _LOW_COVERAGE:
             reasons.append("low_texture")
         # Written so that a NaN residual, of a map without a single measurement, counts as high.
-        high_px = max(_MATCHING_NOISE_PX, _HIGH_RESIDUAL_RATIO * result.working.width)
+        width = result.working.width / (4 if panorama else 1)
+        high_px = max(_MATCHING_NOISE_PX, _HIGH_RESIDUAL_RATIO * width)
         if not found.residual_px <= high_px:
             reasons.append("high_residual")
             fatal = not found.residual_px <= _VERY_HIGH * high_px
@@ -86,7 +89,8 @@ def assess(result: SlamResult, settings: SlamSettings, source_width: int) -> Qua
         fatal = fatal or interpolated > _MOSTLY_INTERPOLATED
     low_deg, high_deg = _fov_interval_deg(result)
     # Lines may tell the focal length of a camera that never moves, but nothing then confirms it.
-    if result.motion == "static" or high_deg - low_deg > 2 * settings.fov_doubt_ratio * result.camera.fov_x_deg:
+    doubt_deg = 2 * settings.fov_doubt_ratio * result.camera.fov_x_deg
+    if not panorama and (result.motion == "static" or high_deg - low_deg > doubt_deg):
         reasons.append("focal_unobservable")
     reliable: Reliability = "no" if fatal else "doubtful" if reasons else "yes"
     to_source = source_width / result.working.width

@@ -64,6 +64,7 @@ class Description:
     rotation_deg: int
     codec: str
     pixel_format: str
+    spherical: bool
 
 
 @dataclass(slots=True)
@@ -152,6 +153,7 @@ def describe(media: OpenedMedia, limits: Limits) -> Description:
             rotation_deg=converter.rotation_deg(first),
             codec=stream.codec_context.name,
             pixel_format=first.format.name,
+            spherical=_is_spherical(first),
         )
 
 
@@ -362,6 +364,13 @@ def _timestamp_s(frame: VideoFrame) -> float | None:
     if frame.pts is None or frame.time_base is None:
         return None
     return float(frame.pts * frame.time_base)
+
+
+def _is_spherical(frame: VideoFrame) -> bool:
+    """Whether the container says that the picture is a whole equirectangular panorama (spherical video metadata)."""
+    # The first field of FFmpeg's description is the projection, of which 0 is this one.
+    found: Any = frame.side_data.get("SPHERICAL")
+    return found is not None and bytes(found)[:4] == bytes(4)
 
 
 def _is_cover(stream: VideoStream) -> bool:

@@ -19,6 +19,7 @@ class VideoInfo:
         fps: Average frame rate (30 for a directory of images).
         rotation_deg: Clockwise rotation that was applied to make the picture upright: 0, 90, 180 or 270.
         frame_names: Names of the files that the pictures are from, without suffix; empty for a video.
+        spherical: Whether the container says that the pictures are equirectangular panoramas.
     """
 
     name: str
@@ -33,6 +34,7 @@ class VideoInfo:
     pixel_format: str
     size_bytes: int
     frame_names: tuple[str, ...] = ()
+    spherical: bool = False
 
 
 @dataclass(frozen=True, slots=True)

@@ -35,10 +35,12 @@ def classical_priors(camera: str = "pinhole") -> PriorFamily:
     Make one per thread. The number of OpenCV threads is the caller's choice.
 
     Args:
-        camera: `pinhole`, `mei`, or `auto` for what the video says.
+        camera: `pinhole`, `mei`, or `auto` for what the video says; `equirect` for the faces of panoramas, which are
+            pinholes.
     """
     initialisers: dict[str, IntrinsicsInit] = {"pinhole": CombinedFocalInit((TwoViewFocal(), VanishingFocal()))}
     initialisers["mei"], initialisers["auto"] = UnifiedInit(), UnifiedInit(initialisers["pinhole"])
+    initialisers["equirect"] = initialisers["pinhole"]
     return PriorFamily(
         matcher=DisFlowMatcher(),
         tracker=LkTracker(),
