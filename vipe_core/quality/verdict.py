@@ -50,7 +50,7 @@ def assess(result: SlamResult, settings: SlamSettings, source_width: int) -> Qua
         source_width: Width of the source video; residuals are reported in its pixels.
     """
     found = result.map
-    # Its lens is no question, and it is as sharp as pictures a quarter as wide.
+    # Its lens is no question, and its faces, enlarged to its own pixels, are 1 / 2.75 of its width.
     panorama = result.camera.model == "equirect"
     reasons: list[str] = []
     fatal = False
@@ -68,7 +68,7 @@ def assess(result: SlamResult, settings: SlamSettings, source_width: int) -> Qua
         if found.coverage < _LOW_COVERAGE:
             reasons.append("low_texture")
         # Written so that a NaN residual, of a map without a single measurement, counts as high.
-        width = result.working.width / (4 if panorama else 1)
+        width = result.working.width / (2.75 if panorama else 1)
         high_px = max(_MATCHING_NOISE_PX, _HIGH_RESIDUAL_RATIO * width)
         if not found.residual_px <= high_px:
             reasons.append("high_residual")
