@@ -25,6 +25,8 @@ if ! .venv/bin/python -m pip --version >/dev/null 2>&1; then
     "$python" -m venv .venv
 fi
 pip=(.venv/bin/python -m pip --disable-pip-version-check --quiet)
+# Modules are compiled when they are first imported: most of what torch and transformers bring never is.
+install=(install --no-compile)
 locked=$(sed -n 's/^torch==//p' requirements.lock)
 
 case "${VIPE_TORCH:-cpu}-$(uname -s)" in
@@ -34,8 +36,8 @@ esac
 installed=$(.venv/bin/python -c 'from importlib.metadata import version; print("torch==" + version("torch"))' 2>/dev/null || true)
 if [ "$installed" != "$torch" ]; then
     echo "Installing $torch ..."
-    if ! log=$("${pip[@]}" install "$torch" 2>&1); then
-        "${pip[@]}" install "$torch" --extra-index-url https://download.pytorch.org/whl/cpu || {
+    if ! log=$("${pip[@]}" "${install[@]}" "$torch" 2>&1); then
+        "${pip[@]}" "${install[@]}" "$torch" --extra-index-url https://download.pytorch.org/whl/cpu || {
             echo "$log" >&2
             exit 1
         }
@@ -44,4 +46,4 @@ fi
 
 extras=$(IFS=,; echo "$*")
 echo "Installing vipe-cluster${extras:+[$extras]} and its dependencies ..."
-"${pip[@]}" install --constraint requirements.lock --editable ".${extras:+[$extras]}"
+"${pip[@]}" "${install[@]}" --constraint requirements.lock --editable ".${extras:+[$extras]}"
