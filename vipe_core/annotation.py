@@ -17,8 +17,8 @@ Reliability = Literal["yes", "doubtful", "no"]
 
 
 def depth_kind_of(camera: Camera) -> DepthKind:
-    """`z` for pinhole; `ray` for the models that see sideways, where z would be zero or negative."""
-    return "z" if camera.model == "pinhole" else "ray"
+    """`z` for pinhole and opencv; `ray` for the models that see sideways, where z would be zero or negative."""
+    return "z" if camera.model in ("pinhole", "opencv") else "ray"
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,6 +111,9 @@ class Provenance:
 
     Attributes:
         scale_source: What the scale was taken from: `normalised`, `metric_depth`, or the user's known length as text.
+        calibration: The camera that the user gave, as `Calibration.to_json`, at the size of the pictures; with
+            `resampled_to`, model, params, width and height of the camera that poses and depth were found in, where its
+            distortion was taken out for that. None where the camera was estimated.
     """
 
     engine_version: str
@@ -122,6 +125,7 @@ class Provenance:
     weights: dict[str, str]
     source: dict[str, object]
     scale_source: str = "normalised"
+    calibration: dict[str, object] | None = None
 
 
 @dataclass(frozen=True, slots=True)

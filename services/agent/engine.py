@@ -63,6 +63,7 @@ class VipeEngine:
     def annotate(
         self, path: Path, video: VideoRef, spec: JobSpec, root: Path, progress: ProgressCallback
     ) -> VideoResult:
+        from vipe_core.cameras.calibration import Calibration
         from vipe_core.formats.artifacts import ALL_ATTRIBUTES, write_artifacts
 
         attributes = [name for name in ALL_ATTRIBUTES if name in (*spec.attributes, "pose", "intrinsics")]
@@ -80,7 +81,10 @@ class VipeEngine:
         def during(at: EngineProgress) -> None:
             report(at.stage, at.frames_done, at.frames_total)
 
-        annotation = self._annotator.annotate(path, name=video.key, scale_from=spec.scale_from, progress=during)
+        known = None if spec.calibration is None else Calibration.from_json(spec.calibration)
+        annotation = self._annotator.annotate(
+            path, name=video.key, scale_from=spec.scale_from, calibration=known, progress=during
+        )
         write_artifacts(
             annotation, root, attributes=attributes, progress=lambda done, all_: report("depth", done, all_)
         )

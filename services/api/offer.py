@@ -82,6 +82,24 @@ def known_length(value: str) -> str:
         raise ValueError(str(error)) from error
 
 
+def calibration(value: dict[str, Any]) -> dict[str, Any]:
+    """Check a calibration as the engine takes it.
+
+    Returns:
+        The same in one form, so that equal calibrations are equal configurations.
+
+    Raises:
+        ValueError: It is not understood.
+    """
+    from vipe_core.cameras.calibration import Calibration
+    from vipe_core.errors import ConfigError
+
+    try:
+        return Calibration.from_json(value).to_json()
+    except ConfigError as error:
+        raise ValueError(str(error)) from error
+
+
 def address(value: str) -> str:
     """Check an absolute path, `s3://bucket/key` or `http(s)://host/path`.
 

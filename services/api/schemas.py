@@ -64,6 +64,13 @@ class JobRequest(ControlFields):
         "goes, `height=METRES` of the camera above the ground, or `depth=METRES@X,Y,FRAME` from the camera to what a "
         "pixel of a frame shows. A video that does not show it fails with `scale_unobservable`.",
     )
+    calibration: Annotated[dict[str, Any], AfterValidator(offer.calibration)] | None = Field(
+        default=None,
+        description="The camera that took every video: `version` 1, `model` (`pinhole`, `mei`, `opencv` or "
+        "`opencv_fisheye`), `width`, `height`, `fx`, `fy`, `cx`, `cy`, `alpha` or `distortion`, `pixel_centre` (`half` "
+        "or `integer`) and `use` (`fixed`, or `initial` for a starting point). In place of `camera`. A video of "
+        "another aspect fails with `calibration_mismatch`.",
+    )
 
     phrases: list[Annotated[str, Field(max_length=64)]] | None = Field(
         default=None,
@@ -88,6 +95,8 @@ class JobRequest(ControlFields):
             raise ValueError("output must not be the root directory")
         if self.output.rstrip("/") in {uri.rstrip("/") for uri in self.inputs}:
             raise ValueError("output must not be one of the inputs")
+        if self.calibration is not None and self.camera is not None:
+            raise ValueError("camera and calibration exclude each other: the calibration says which model it is")
         if "\x00" in self.name:
             raise ValueError("name must not hold NUL characters")
         offer.preset_options(self.preset, self._options())
@@ -113,6 +122,7 @@ class JobRequest(ControlFields):
             name=self.name,
             scale_from=self.scale_from,
             **self._options(),
+            calibration=self.calibration,
         )
 
 
@@ -133,6 +143,7 @@ class SpecView(_View):
     phrases: list[str] | None
     detection_interval_s: float | None
     metric_depth: str | None
+    calibration: dict[str, Any] | None
 
 
 class ProgressView(_View):

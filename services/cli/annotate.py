@@ -12,6 +12,7 @@ import typer
 
 if TYPE_CHECKING:
     from vipe_core.annotation import Annotation
+    from vipe_core.cameras.calibration import Calibration
     from vipe_core.pipeline.annotator import Annotator
 
 
@@ -74,6 +75,14 @@ def annotate(
         str | None,
         typer.Option(metavar="NETWORK", help="What tells the scale, such as hf.depth_pro or nvidia_vipe.unidepth."),
     ] = None,
+    calibration: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="The camera, where it is known: our camera.json, COLMAP's cameras.txt, OpenCV's YAML or XML, or "
+            "nerfstudio's transforms.json. What it says of `use` decides: fixed, or initial for a starting point.",
+        ),
+    ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="One JSON line per input on stdout, nothing else.")] = False,
 ) -> None:
     """Annotate videos on this machine, without the service.
@@ -83,6 +92,7 @@ def annotate(
     from rich.console import Console
 
     from services.cli.settings import read_settings
+    from vipe_core.cameras.calibration_files import read_calibration
     from vipe_core.depth.known import KnownLength
     from vipe_core.errors import ConfigError, VipeError
     from vipe_core.formats import SequenceNames
@@ -102,6 +112,12 @@ def annotate(
             KnownLength.parse(scale_from)
         except ConfigError as error:
             raise typer.BadParameter(str(error), param_hint="--scale-from") from error
+    if calibration is not None and camera is not None:
+        raise typer.BadParameter("the calibration says which model the camera has", param_hint="--camera")
+    try:
+        known = None if calibration is None else read_calibration(calibration)
+    except ConfigError as error:
+        raise typer.BadParameter(str(error), param_hint="--calibration") from error
     use_limits(read_settings().media_limits())
     console = Console(stderr=True, quiet=as_json)
     words = None if phrases is None else tuple(word.strip() for word in phrases.split(",") if word.strip())
@@ -124,7 +140,7 @@ def annotate(
     for path in paths:
         started = time.perf_counter()
         try:
-            row = _annotate_one(annotator, path, output, names.name_for(path), masks, scale_from, console)
+            row = _annotate_one(annotator, path, output, names.name_for(path), masks, scale_from, known, console)
             row["seconds"] = round(time.perf_counter() - started, 3)
             row["frames_per_s"] = round(row["num_frames"] / row["seconds"], 3)
         except VipeError as error:
@@ -160,6 +176,7 @@ def _annotate_one(
     name: str,
     masks: Path | None,
     scale_from: str | None,
+    calibration: Calibration | None,
     console: Any,
 ) -> dict[str, Any]:
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
@@ -180,7 +197,9 @@ def _annotate_one(
         def report(progress: EngineProgress) -> None:
             bars.update(task, description=progress.stage, completed=progress.frames_done, total=progress.frames_total)
 
-        annotation = annotator.annotate(path, name=name, masks=masks, scale_from=scale_from, progress=report)
+        annotation = annotator.annotate(
+            path, name=name, masks=masks, scale_from=scale_from, calibration=calibration, progress=report
+        )
 
         def written(done: int, total: int) -> None:
             bars.update(task, description="depth", completed=done, total=total)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -83,6 +84,10 @@ def submit(
     metric_depth: Annotated[
         str | None, typer.Option(metavar="NETWORK", help="What tells the scale, as `vipectl annotate --metric-depth`.")
     ] = None,
+    calibration: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="The camera of every video, as `vipectl annotate --calibration`."),
+    ] = None,
     attributes: Annotated[
         str | None,
         typer.Option(metavar="A,B,...", help="Tars to write: depth,rgb,mask,confidence; the last only if named."),
@@ -122,6 +127,8 @@ def submit(
         spec["detection_interval_s"] = detection_interval
     if metric_depth is not None:
         spec["metric_depth"] = metric_depth
+    if calibration is not None:
+        spec["calibration"] = _calibration(calibration)
     if attributes is not None:
         spec["attributes"] = [name.strip() for name in attributes.split(",") if name.strip()]
     job = client.submit(spec, idempotency_key=key)
@@ -131,6 +138,16 @@ def submit(
         typer.echo(job["id"])
     if wait:
         _watch(client, job["id"])
+
+
+def _calibration(path: Path) -> dict[str, Any]:
+    from vipe_core.cameras.calibration_files import read_calibration
+    from vipe_core.errors import ConfigError
+
+    try:
+        return read_calibration(path).to_json()
+    except ConfigError as error:
+        raise typer.BadParameter(str(error), param_hint="--calibration") from error
 
 
 def list_jobs(limit: int = 20, api: ApiUrl = DEFAULT_API, api_key: ApiKey = None, as_json: AsJson = False) -> None:

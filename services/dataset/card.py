@@ -88,7 +88,7 @@ def dataset_card(job_id: str, spec: JobSpec, totals: Mapping[str, Any]) -> str:
         title=title,
         size=next((label for limit, label in _SIZES if totals["succeeded"] < limit), "1M<n<10M"),
         preset=spec.preset,
-        camera=spec.camera,
+        camera=spec.camera if spec.calibration is None else spec.calibration["model"],
         hours=totals["duration_s"] / 3600,
         job_id=job_id,
         config_hash=spec.config_hash,

@@ -62,6 +62,7 @@ def meta_schema(spec: JobSpec) -> pa.Schema:
         ("num_keyframes", pa.int32()),
         ("camera_model", pa.string()),
         *((name, pa.float64()) for name in _PARAMETERS),
+        ("distortion", pa.list_(pa.float64())),
         ("fov_x_deg", pa.float64()),
         ("trajectory_length", pa.float64()),
         ("scale", pa.string()),
@@ -96,7 +97,10 @@ def meta_row(record: CommitRecord, video: VideoResult) -> dict[str, Any]:
         raise IntegrityError(f"the record of shard {record.shard_id} counts {video.key} as done, without its payload")
     quality: Mapping[str, Any] = video.quality or {}
     provenance: Mapping[str, Any] = video.provenance or {}
-    parameters = dict(zip(_PARAMETERS, video.camera_params or (), strict=False))
+    params = video.camera_params or ()
+    # What follows the principal point is the bend of a unified camera, or a lens's measured distortion.
+    unified = video.camera_model == "mei"
+    parameters = dict(zip(_PARAMETERS, params if unified else params[:4], strict=False))
     row: dict[str, Any] = {
         "sequence": video.key,
         "num_frames": video.num_frames,
@@ -110,6 +114,7 @@ def meta_row(record: CommitRecord, video: VideoResult) -> dict[str, Any]:
         "num_keyframes": video.num_keyframes,
         "camera_model": video.camera_model,
         **{name: parameters.get(name) for name in _PARAMETERS},
+        "distortion": None if unified or len(params) == 4 or not params else list(params[4:]),
         "fov_x_deg": video.fov_x_deg,
         "trajectory_length": video.trajectory_length,
         "scale": video.scale,

@@ -35,6 +35,7 @@ class JobSpec:
         phrases: What is found, followed and masked; None for what the preset does.
         detection_interval_s: Time between looks for new things; None for the preset's own.
         metric_depth: Network that tells the scale; None for the preset's own.
+        calibration: The camera that took every video of the job, in the engine's JSON; None where it is estimated.
     """
 
     inputs: tuple[str, ...]
@@ -49,6 +50,7 @@ class JobSpec:
     phrases: tuple[str, ...] | None = None
     detection_interval_s: float | None = None
     metric_depth: str | None = None
+    calibration: dict[str, Any] | None = None
 
     @property
     def config_hash(self) -> str:
@@ -57,6 +59,8 @@ class JobSpec:
         if self.scale_from is not None:
             config["scale_from"] = self.scale_from
         config |= {name: value for name, value in self.preset_options.items() if value is not None}
+        if self.calibration is not None:
+            config["calibration"] = self.calibration
         return hashlib.sha256(json.dumps(config, sort_keys=True).encode()).hexdigest()
 
     @property

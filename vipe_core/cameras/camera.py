@@ -76,15 +76,23 @@ class Camera:
         if self.model == "equirect":
             return 360.0
         fx, cx = self.params[0], self.params[2]
-        return math.degrees(self._angle(cx / fx) + self._angle((self.width - cx) / fx))
+        return math.degrees(self._angle((self.width - cx) / fx, 0) - self._angle(-cx / fx, 0))
 
-    def _angle(self, m: float) -> float:
-        """Angle from the axis at a distance m from the principal point along x, in focal lengths."""
+    @property
+    def fov_y_deg(self) -> float:
+        """Angle between the upper and lower edge rays through the column of the principal point, degrees."""
+        if self.model == "equirect":
+            return 180.0
+        fy, cy = self.params[1], self.params[3]
+        return math.degrees(self._angle(0, (self.height - cy) / fy) - self._angle(0, -cy / fy))
+
+    def _angle(self, mx: float, my: float) -> float:
+        """Signed angle from the optical axis of a place on a line through the principal point, in focal lengths."""
         if self.distorted:
-            fx, _, cx, cy = self.index_params()[:4]
-            x, _, z = self.unproject((cx + m * fx, cy))
-            return math.atan2(float(x), float(z))
-        alpha = self.params[4] if self.model == "mei" else 0.0
+            fx, fy, cx, cy = self.index_params()[:4]
+            x, y, z = self.unproject((cx + mx * fx, cy + my * fy))
+            return math.atan2(float(x) if mx else float(y), float(z))
+        alpha, m = self.params[4] if self.model == "mei" else 0.0, mx + my
         eta = (alpha + math.sqrt(max(0.0, 1 + (1 - alpha * alpha) * m * m))) / (1 + m * m)
         return math.atan2(eta * m, eta - alpha)
 

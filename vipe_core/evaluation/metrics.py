@@ -174,7 +174,7 @@ def camera_errors(estimate: Camera, truth: Camera) -> CameraErrors | None:
         return None
     return CameraErrors(
         fov_x_deg=abs(estimate.fov_x_deg - truth.fov_x_deg),
-        fov_y_deg=abs(_fov_y_deg(estimate) - _fov_y_deg(truth)),
+        fov_y_deg=abs(estimate.fov_y_deg - truth.fov_y_deg),
         focal_percent=100 * abs(estimate.focal_px / truth.focal_px - 1),
     )
 
@@ -275,6 +275,10 @@ def z_from_ray(camera: Camera, height: int, width: int) -> NDArray[np.float64]:
         latitude = np.sin(v / camera.height * math.pi)[:, None]
         grid: NDArray[np.float64] = latitude * np.cos((u / camera.width - 0.5) * (2 * math.pi))
         return grid
+    if camera.distorted:
+        rays = camera.rays(height, width)
+        toward: NDArray[np.float64] = rays[..., 2] / np.linalg.norm(rays, axis=-1)
+        return toward
     fx, fy, cx, cy, *rest = camera.params
     rho2 = ((u - cx) / fx) ** 2 + (((v - cy) / fy) ** 2)[:, None]
     alpha = rest[0] if rest else 0.0
@@ -395,12 +399,6 @@ def _nearest_rotation(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
     u, _, vt = np.linalg.svd(matrix)
     rotation: NDArray[np.float64] = (u * np.array([1.0, 1.0, np.linalg.det(u @ vt)])) @ vt
     return rotation
-
-
-def _fov_y_deg(camera: Camera) -> float:
-    """Vertical field of view: the horizontal one of the transposed camera."""
-    fx, fy, cx, cy, *rest = camera.params
-    return Camera(camera.model, (fy, fx, cy, cx, *rest), camera.height, camera.width).fov_x_deg
 
 
 def _spread(points: NDArray[np.float64]) -> float:

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vipe_core.annotation import DepthKind
-from vipe_core.cameras import Camera, CameraModel
+from vipe_core.cameras import MODEL_CODE, Camera, CameraModel
 from vipe_core.errors import ConfigError, FormatError
 from vipe_core.evaluation.metrics import (
     CameraErrors,
@@ -33,7 +33,7 @@ from vipe_core.evaluation.metrics import (
 )
 from vipe_core.formats import Artifacts
 
-_MODELS: dict[str, CameraModel] = {"pinhole": "pinhole", "mei": "mei", "equirect": "equirect"}
+_MODELS: dict[str, CameraModel] = {model: model for model in MODEL_CODE}
 _KINDS: dict[str, DepthKind] = {"z": "z", "ray": "ray"}
 # Depth values that one comparison holds in memory; of longer or finer sequences every k-th row and column counts.
 _MAX_DEPTH_VALUES = 20_000_000

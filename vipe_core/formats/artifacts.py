@@ -35,7 +35,13 @@ ALL_ATTRIBUTES: tuple[Attribute, ...] = ("pose", "intrinsics", "depth", "rgb", "
 
 INFO_SCHEMA = 1
 # What a depth value means on disk is fixed by the camera: along the axis, except for panoramas.
-DISK_DEPTH_KINDS: dict[CameraModel, DepthKind] = {"pinhole": "z", "mei": "z", "equirect": "ray"}
+DISK_DEPTH_KINDS: dict[CameraModel, DepthKind] = {
+    "pinhole": "z",
+    "mei": "z",
+    "equirect": "ray",
+    "opencv": "z",
+    "opencv_fisheye": "z",
+}
 # Key, attribute and member of everything that is written frame by frame.
 _DENSE = (
     ("depth", "depth", "zip"),
@@ -44,7 +50,14 @@ _DENSE = (
     ("confidence", "confidence", "zip"),
     ("kind", "confidence", "kind.zip"),
 )
-DISK_CAMERA_NAMES = {"pinhole": "PINHOLE", "mei": "MEI", "equirect": "PANORAMA"}
+# The last two are no models of the original tool: it refuses them, which is better than to take them for pinholes.
+DISK_CAMERA_NAMES: dict[CameraModel, str] = {
+    "pinhole": "PINHOLE",
+    "mei": "MEI",
+    "equirect": "PANORAMA",
+    "opencv": "OPENCV",
+    "opencv_fisheye": "OPENCV_FISHEYE",
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -136,7 +149,8 @@ def write_artifacts(
 
 
 def disk_intrinsics(camera: Camera) -> NDArray[np.float32]:
-    """The parameters as they lie on disk: (4,) pinhole, (5,) mei, four zeros for a panorama; half-pixel centres."""
+    """`Camera.params` as they lie on disk, half-pixel centres: (4,) pinhole, (5,) mei, (12,) opencv, (8,)
+    opencv_fisheye; four zeros for a panorama."""
     return np.array(camera.params or (0.0, 0.0, 0.0, 0.0), dtype=np.float32)
 
 

@@ -1,7 +1,8 @@
 """A sequence as a COLMAP reconstruction: `images/`, and `sparse/0/{cameras,images,points3D}` in binary or text.
 
 The world is that of the poses. COLMAP's pixels have half-pixel centres like ours, its image poses are cam_from_world
-with quaternions wxyz. Camera models: pinhole is PINHOLE; mei is EUCM with beta = 1 and panoramas are EQUIRECTANGULAR,
+with quaternions wxyz. Camera models: pinhole is PINHOLE; opencv is OPENCV, or FULL_OPENCV where it has more than four
+coefficients; opencv_fisheye is OPENCV_FISHEYE; mei is EUCM with beta = 1 and panoramas are EQUIRECTANGULAR,
 which COLMAP reads from version 4 on. u = fx X / (Z + a |P|) is EUCM's fx' X / (a' |P| + (1 - a') Z) with
 a' = a / (1 + a) and fx' = fx / (1 + a). Points are those of the fused cloud that frames see, with where they see them.
 """
@@ -53,6 +54,10 @@ def colmap_camera(camera: Camera) -> tuple[str, int, tuple[float, ...]]:
     if camera.model == "mei":
         fx, fy, cx, cy, alpha = camera.params
         return "EUCM", 16, (fx / (1 + alpha), fy / (1 + alpha), cx, cy, alpha / (1 + alpha), 1.0)
+    if camera.model == "opencv_fisheye":
+        return "OPENCV_FISHEYE", 5, camera.params
+    if camera.model == "opencv":
+        return ("FULL_OPENCV", 6, camera.params) if any(camera.params[8:]) else ("OPENCV", 4, camera.params[:8])
     return "EQUIRECTANGULAR", 17, (float(camera.width), float(camera.height))
 
 

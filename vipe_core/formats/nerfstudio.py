@@ -44,7 +44,7 @@ def export_nerfstudio(
         voxel, min_confidence: Of the cloud, see `fuse_cloud`.
 
     Raises:
-        ExportUnsupported: A unified (mei) camera, which nerfstudio has no model for.
+        ExportUnsupported: A unified (mei) camera, or a rational distortion, which nerfstudio has no models for.
         FormatError: No depth or no rgb, or `out` is something else than an earlier export.
     """
     intrinsics = _intrinsics(artifacts.name, artifacts.camera)
@@ -79,11 +79,21 @@ def export_nerfstudio(
 
 def _intrinsics(name: str, camera: Camera) -> dict[str, Any]:
     if camera.model == "mei":
-        raise ExportUnsupported(f"{name}: nerfstudio has no model of a unified (mei) camera; use the format colmap")
+        raise ExportUnsupported(
+            f"{name}: nerfstudio has no model of a unified (mei) camera; use the format colmap, or --rectify"
+        )
     if camera.model == "equirect":
         # Its panoramas map x / fl_x = -1..1 to the full turn, and y / fl_y = -1/2..1/2 to the half turn.
         half = camera.width / 2
         names = dict(zip(("fl_x", "fl_y", "cx", "cy"), (half, camera.height, half, camera.height / 2), strict=True))
         return {"camera_model": "EQUIRECTANGULAR", **names}
-    names = dict(zip(("fl_x", "fl_y", "cx", "cy"), camera.params, strict=True))
-    return {"camera_model": "OPENCV", **names, "k1": 0.0, "k2": 0.0, "p1": 0.0, "p2": 0.0}
+    names = dict(zip(("fl_x", "fl_y", "cx", "cy"), camera.params, strict=False))
+    if camera.model == "opencv_fisheye":
+        lens = dict(zip(("k1", "k2", "k3", "k4"), camera.params[4:], strict=True))
+        return {"camera_model": "OPENCV_FISHEYE", **names, **lens}
+    k1, k2, p1, p2, k3, *rational = camera.params[4:] or (0.0,) * 8
+    if any(rational):
+        raise ExportUnsupported(
+            f"{name}: nerfstudio has no model of a rational distortion (k4 to k6); use the format colmap, or --rectify"
+        )
+    return {"camera_model": "OPENCV", **names, "k1": k1, "k2": k2, "k3": k3, "p1": p1, "p2": p2}

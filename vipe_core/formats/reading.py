@@ -31,6 +31,8 @@ _MODELS: dict[str, tuple[CameraModel, int]] = {
     "PINHOLE": ("pinhole", 4),
     "MEI": ("mei", 5),
     "PANORAMA": ("equirect", 4),
+    "OPENCV": ("opencv", 12),
+    "OPENCV_FISHEYE": ("opencv_fisheye", 8),
 }
 
 
@@ -41,7 +43,8 @@ class Artifacts:
     Attributes:
         world_from_cam: (N, 4, 4) float64, OpenCV axes.
         frame_index: (N,) int64 index of each pose within the processed stream.
-        camera: Shared camera: per-parameter median over the frames, at the resolution of the files.
+        camera: Shared camera at the resolution of the files: per-parameter median over the frames, with all the digits
+            that our info file has of it.
         intrinsics: (N, D) float64 as stored.
         depth_kind: `ray` for panoramas, else `z`.
         timestamps_s: (N,) float64, or None where no info file says.
@@ -132,7 +135,7 @@ def read_artifacts(root: str | Path, name: str) -> Artifacts:
     width, height = _picture_size(root, name, info)
     params = () if model == "equirect" else tuple(float(value) for value in np.median(intrinsics, axis=0))
     try:
-        camera = Camera(model, params, width, height)
+        camera = Camera(model, _with_all_digits(params, info.get("camera")), width, height)
     except ConfigError as error:
         raise FormatError(f"intrinsics/{name}.npz: {error}") from error
     stamps = info.get("timestamps_s")
@@ -202,6 +205,15 @@ def _read_info(path: Path, num_frames: int) -> dict[str, Any]:
     if not all(isinstance(stamp, (int, float)) for stamp in stamps):
         raise FormatError(f"{path.parent.name}/{path.name}: `timestamps_s` must be numbers")
     return info
+
+
+def _with_all_digits(params: tuple[float, ...], stated: Any) -> tuple[float, ...]:
+    """The parameters as the info file has them where those are the same numbers: intrinsics on disk are float32."""
+    whole = stated.get("params") if isinstance(stated, dict) else None
+    if not isinstance(whole, list) or not all(isinstance(value, (int, float)) for value in whole):
+        return params
+    same = np.array_equal(np.array(whole, np.float32), np.array(params, np.float32))
+    return tuple(float(value) for value in whole) if same else params
 
 
 def _picture_size(root: Path, name: str, info: dict[str, Any]) -> tuple[int, int]:

@@ -1,8 +1,8 @@
 """One sequence as a single npz of plain arrays, for evaluation scripts that do not know ViPE's layout.
 
-Keys: cam_to_world (N,4,4) float64; intrinsics (N,D) float64 (fx, fy, cx, cy [, alpha], half-pixel centres, pixels of
-width x height); frame_index (N,) int64; camera (`pinhole`, `mei`, `equirect`); width, height; depth (N,h,w) float16,
-where 0 is no value; depth_kind (`z` or `ray`).
+Keys: cam_to_world (N,4,4) float64; intrinsics (N,D) float64 (`Camera.params`: fx, fy, cx, cy [, alpha or distortion],
+half-pixel centres, pixels of width x height); frame_index (N,) int64; camera (a model of `Camera`); width, height;
+depth (N,h,w) float16, where 0 is no value; depth_kind (`z` or `ray`).
 """
 
 from __future__ import annotations

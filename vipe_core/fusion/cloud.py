@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from vipe_core.annotation import DepthKind
 from vipe_core.cameras import MODEL_CODE, Camera
 from vipe_core.fusion.kernels import add_points, coarsen_points, seen_through, surface_normals
-from vipe_core.fusion.views import SurfaceView, points_per_depth
+from vipe_core.fusion.views import SurfaceView, kernel_params, points_per_depth
 from vipe_core.geometry.arrays import inverse
 
 Array = NDArray[Any]
@@ -68,7 +68,7 @@ class CloudFuser:
             raise ValueError(f"a voxel needs a size and a cloud at least eight points, got {voxel} and {max_points}")
         self.voxel = float(voxel)
         self._model = MODEL_CODE[camera.model]
-        self._params = camera.index_params()
+        self._params = kernel_params(camera)
         self._by_z = kind == "z"
         self._rays = points_per_depth(camera, kind)
         self._table = np.full(1 << (2 * max_points - 1).bit_length(), -1, np.int32)

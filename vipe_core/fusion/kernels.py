@@ -21,6 +21,36 @@ BLOCK = 8
 
 
 @compiled
+def _project_opencv(params: Array, x: float, y: float, z: float) -> tuple[float, float, bool]:
+    """`cameras.distortion`; params (fx, fy, cx, cy, k1, k2, p1, p2, k3, k4, k5, k6, largest slope)."""
+    if z <= 1e-9:
+        return 0.0, 0.0, False
+    a, b = x / z, y / z
+    r2 = a * a + b * b
+    if r2 > params[12] * params[12]:
+        return 0.0, 0.0, False
+    g = (1 + r2 * (params[4] + r2 * (params[5] + r2 * params[8]))) / (
+        1 + r2 * (params[9] + r2 * (params[10] + r2 * params[11]))
+    )
+    u = g * a + 2 * params[6] * a * b + params[7] * (r2 + 2 * a * a)
+    v = g * b + params[6] * (r2 + 2 * b * b) + 2 * params[7] * a * b
+    return params[0] * u + params[2], params[1] * v + params[3], True
+
+
+@compiled
+def _project_fisheye(params: Array, x: float, y: float, z: float) -> tuple[float, float, bool]:
+    """`cameras.distortion`; params (fx, fy, cx, cy, k1, k2, k3, k4, largest angle)."""
+    across = math.sqrt(x * x + y * y)
+    angle = math.atan2(across, z)
+    if angle > params[8]:
+        return 0.0, 0.0, False
+    t2 = angle * angle
+    d = angle * (1 + t2 * (params[4] + t2 * (params[5] + t2 * (params[6] + t2 * params[7]))))
+    scale = d / across if across > 0 else 0.0
+    return params[0] * scale * x + params[2], params[1] * scale * y + params[3], True
+
+
+@compiled
 def _project(model: int, params: Array, x: float, y: float, z: float) -> tuple[float, float, bool]:
     """Index coordinates of a point of the camera frame, and whether the model images it; `CONVENTIONS.md`."""
     if model == 0:
@@ -33,6 +63,10 @@ def _project(model: int, params: Array, x: float, y: float, z: float) -> tuple[f
         if s <= 1e-6 * norm or (params[4] > 1 and params[4] * z <= -norm):
             return 0.0, 0.0, False
         return params[0] * x / s + params[2], params[1] * y / s + params[3], True
+    if model == 3:
+        return _project_opencv(params, x, y, z)
+    if model == 4:
+        return _project_fisheye(params, x, y, z)
     u = (math.atan2(x, z) / (2 * math.pi) + 0.5) * params[0] - 0.5
     v = math.atan2(math.sqrt(x * x + z * z), -y) / math.pi * params[1] - 0.5
     return u, v, norm > 0

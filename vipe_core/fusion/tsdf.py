@@ -25,7 +25,7 @@ from vipe_core.fusion.kernels import (
     touch_blocks,
 )
 from vipe_core.fusion.surface import extract
-from vipe_core.fusion.views import SurfaceView, points_per_depth
+from vipe_core.fusion.views import SurfaceView, kernel_params, points_per_depth
 from vipe_core.geometry.arrays import inverse
 
 # The field is known this many voxels to either side of a surface.
@@ -75,7 +75,7 @@ class TsdfVolume:
             raise ValueError(f"a voxel needs a size and a volume at least eight blocks, got {voxel} and {max_blocks}")
         self.voxel = float(voxel)
         self._model = MODEL_CODE[camera.model]
-        self._params = camera.index_params()
+        self._params = kernel_params(camera)
         self._by_z = kind == "z"
         self._rays = points_per_depth(camera, kind)
         self._table = np.full(1 << (2 * max_blocks - 1).bit_length(), -1, np.int32)

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from vipe_core.annotation import DepthKind
 from vipe_core.cameras import Camera
+from vipe_core.cameras.distortion import limit
 
 Array = NDArray[Any]
 
@@ -72,14 +73,23 @@ def surface_weight(
     return np.where(usable, confidence, 0).astype(np.float32)
 
 
+def kernel_params(camera: Camera) -> NDArray[np.float64]:
+    """Parameters of a camera as the compiled loops of fusion take them: with how far a distorted lens images."""
+    params = camera.index_params()
+    return np.append(params, limit(camera.model, params[4:])) if camera.distorted else params
+
+
 def points_per_depth(camera: Camera, kind: DepthKind) -> NDArray[np.float32]:
     """(H, W, 3) float32: depth of `kind` times this is the point in the camera frame; 0 where there is no such depth.
 
     A pixel at or beyond 90 degrees has no depth along the axis.
     """
     rays = camera.rays()
+    if camera.distorted:
+        v, u = np.indices(rays.shape[:2])
+        rays = np.where(camera.has_ray(np.stack((u, v), axis=-1))[..., None], rays, 0)
     if kind == "ray":
-        rays = rays / np.linalg.norm(rays, axis=-1, keepdims=True)
+        rays = rays / np.maximum(np.linalg.norm(rays, axis=-1, keepdims=True), 1e-300)
     else:
         ahead = rays[..., 2:] > 1e-6
         rays = np.where(ahead, rays / np.where(ahead, rays[..., 2:], 1), 0)

@@ -14,6 +14,7 @@ import torch
 
 from vipe_core.annotation import (
     MASK_PHRASES,
+    UNOBSERVED,
     Annotation,
     DenseFrame,
     Progress,
@@ -21,10 +22,15 @@ from vipe_core.annotation import (
     Provenance,
     depth_kind_of,
 )
+from vipe_core.cameras import Camera
+from vipe_core.cameras.calibration import Calibration
+from vipe_core.cameras.calibration_files import read_calibration
+from vipe_core.cameras.resampling import Resampling
 from vipe_core.depth.aligned import AlignedDepth
 from vipe_core.depth.known import KnownLength
 from vipe_core.depth.scene import scene_of
 from vipe_core.depth.stream import DenseDepth
+from vipe_core.depth.types import DepthFrame
 from vipe_core.depth.without import NoDepth
 from vipe_core.errors import ConfigError, EngineError, VipeError
 from vipe_core.pipeline.device import describe_device, resolve_device, set_threads
@@ -40,6 +46,7 @@ from vipe_core.slam.panorama import PanoramaSlam
 from vipe_core.slam.system import Slam
 from vipe_core.video import MaskedView, open_source
 from vipe_core.video.instances import InstanceMaps, InstanceView
+from vipe_core.video.resampled import ResampledView
 from vipe_core.video.source import FrameSource
 
 logger = logging.getLogger(__name__)
@@ -92,6 +99,7 @@ class Annotator:
         name: str | None = None,
         masks: str | Path | None = None,
         scale_from: str | None = None,
+        calibration: Calibration | str | Path | None = None,
         progress: ProgressCallback | None = None,
     ) -> Annotation:
         """Poses, camera and quality of a video file or a directory of images; dense depth when it is asked for.
@@ -104,19 +112,23 @@ class Annotator:
             scale_from: A length that is known, which makes the scale metric: `path=12.3` (metres that the camera goes),
                 `height=1.6` (of the camera above the ground, which must be in view) or `depth=2.4@x,y,frame` (from the
                 camera to what a pixel of a frame shows). Without one, and without metric depth, scale is relative.
+            calibration: The camera where it is known, or its file (`cameras.calibration_files`), in place of the model
+                that the preset estimates. A fixed one is returned as it was given. Of a lens with measured
+                distortion the pictures are resampled for the work, and all outputs are for the pictures as they are.
             progress: Told how far the annotation is; an exception out of it ends the annotation.
 
         Raises:
-            InputError, DecodeError: The input cannot be read, or the masks are not of this video (MaskMismatch). Code
-                and message are meant for the user.
+            InputError, DecodeError: The input cannot be read, or the masks (MaskMismatch) or the calibration
+                (CalibrationMismatch) are not of this video. Code and message are meant for the user.
             ScaleUnobservable: The video does not show the known length.
-            ConfigError: `scale_from` is not understood.
+            ConfigError: `scale_from` or the file of the calibration is not understood.
             EngineError: A stage failed, a defect of ours; what went wrong is its `__cause__`. So does the dense stream.
         """
         known = None if scale_from is None else KnownLength.parse(scale_from)
         source = open_source(video, name=name) if isinstance(video, (str, Path)) else video
         if masks is not None:
             source = MaskedView(source, masks)
+        given = _given(calibration, source)
         report = Reporter(progress)
         instances: InstanceMaps | None = None
         masks_start_s = time.perf_counter()
@@ -125,9 +137,15 @@ class Annotator:
                 instances = find_instances(source, self._masks, report)
             source = InstanceView(source, instances)
         masks_s = time.perf_counter() - masks_start_s
+        if given is not None and given.camera.distorted:
+            source = ResampledView(source, Resampling.of(given.camera))
 
         with typed_errors(source, report), torch.inference_mode():
-            result = self._slam(self._model(source)).run(source, report)
+            if given is None:
+                result = self._slam(self._model(source)).run(source, report)
+            else:
+                slam = Slam(self._priors(), self.preset.slam, self.device)
+                result = slam.run(source, report, _solved(given, source))
             quality = assess(result, self.preset.slam, source.info.width)
             scaled = set_scale(scene_of(result), source, known, self._depth.metric, report)
             quality = dataclasses.replace(quality, scale_sigma_ratio=scaled.sigma_ratio)
@@ -145,14 +163,14 @@ class Annotator:
         return Annotation(
             name=source.info.name,
             world_from_cam=scaled.scene.world_from_cam,
-            camera=result.camera.resized(source.info.width, source.info.height),
+            camera=_final_camera(result.camera, given, source),
             timestamps_s=result.timestamps_s,
             fps=source.info.fps,
             keyframes=result.keyframes,
             scale=scaled.scale,
             depth_kind=depth_kind_of(result.camera),
             quality=quality,
-            provenance=self._provenance(source, scaled),
+            provenance=self._provenance(source, scaled, given),
             dense=lambda: self._dense(source, scaled, instances, timings, report),
             timings_s=timings,
             mask_phrases=dict(MASK_PHRASES) if instances is None else instances.phrases,
@@ -175,7 +193,17 @@ class Annotator:
             raise ConfigError(f"the preset {self.preset.name} does not annotate panoramas; panorama and classical do")
         return PanoramaSlam(priors, self.preset.slam, self.device)
 
-    def _provenance(self, source: FrameSource, scaled: ScaledScene) -> Provenance:
+    def _provenance(self, source: FrameSource, scaled: ScaledScene, given: Calibration | None = None) -> Provenance:
+        calibration: dict[str, object] | None = None
+        providers = self.preset.providers
+        if given is not None:
+            calibration = given.to_json()
+            providers = {**providers, "intrinsics_init": "calibration"}
+        if isinstance(source, ResampledView) and calibration is not None:
+            ideal = source.resampling.ideal
+            size = {"width": ideal.width, "height": ideal.height}
+            calibration["resampled_to"] = {"model": ideal.model, "params": list(ideal.params), **size}
+            source = source.source
         if isinstance(source, InstanceView):
             source = source.source
         info = source.info
@@ -185,7 +213,7 @@ class Annotator:
             config_hash=self.preset.config_hash,
             device=describe_device(self.device, self.threads),
             libraries=library_versions(),
-            providers=self.preset.providers,
+            providers=providers,
             weights=self._weights,
             source={
                 "name": info.name,
@@ -195,9 +223,11 @@ class Annotator:
                 "pixel_format": info.pixel_format,
                 "size_bytes": info.size_bytes,
                 "rotation_deg": info.rotation_deg,
+                "pixel_aspect": info.pixel_aspect,
                 **({"num_masks": source.num_masks} if isinstance(source, MaskedView) else {}),
             },
             scale_source=scaled.source,
+            calibration=calibration,
         )
 
     def _dense(
@@ -213,6 +243,8 @@ class Annotator:
         spent_s = 0.0
         with typed_errors(source, report):
             stream = self._depth_stage(scaled).stream(source, scaled.scene)
+            if isinstance(source, ResampledView):
+                stream = _taken_back(stream, source)
         with closing(stream) as frames:
             while True:
                 start_s = time.perf_counter()
@@ -236,6 +268,44 @@ class Annotator:
         if self._depth.video is None:
             return DenseDepth(self.preset.dense_depth)
         return AlignedDepth(self._depth, self.preset.alignment, metres=scaled.scale == "metric")
+
+
+def _given(calibration: Calibration | str | Path | None, source: FrameSource) -> Calibration | None:
+    """The calibration at the size of the source."""
+    if calibration is None:
+        return None
+    known = calibration if isinstance(calibration, Calibration) else read_calibration(calibration)
+    return known.for_size(source.info.width, source.info.height, source.info.name)
+
+
+def _solved(given: Calibration | None, source: FrameSource) -> Calibration | None:
+    """The calibration of the pictures that are worked with."""
+    if given is not None and isinstance(source, ResampledView):
+        return dataclasses.replace(given, camera=source.resampling.ideal)
+    return given
+
+
+def _final_camera(found: Camera, given: Calibration | None, source: FrameSource) -> Camera:
+    """The camera of the pictures as they are."""
+    if given is not None and given.use == "fixed":
+        return given.camera
+    if isinstance(source, ResampledView):
+        return source.resampling.refined(found)
+    return found.resized(source.info.width, source.info.height)
+
+
+def _taken_back(stream: Generator[DepthFrame, None, None], view: ResampledView) -> Generator[DepthFrame, None, None]:
+    """Frames of resampled pictures as frames of the pictures themselves."""
+    with closing(stream) as frames, closing(view.source.frames()) as pictures:
+        for frame, picture in zip(frames, pictures, strict=False):
+            yield DepthFrame(
+                frame.index,
+                picture.rgb,
+                view.depth_back(frame.depth),
+                view.back(frame.confidence),
+                view.back(frame.kind, UNOBSERVED),
+                view.back(frame.moving.view(np.uint8)).view(np.bool_),
+            )
 
 
 class Reporter:
@@ -280,6 +350,7 @@ def annotate(
     device: str = "cpu",
     masks: str | Path | None = None,
     scale_from: str | None = None,
+    calibration: Calibration | str | Path | None = None,
     progress: ProgressCallback | None = None,
 ) -> Annotation:
     """Annotate one video; see `Annotator`, which is the better choice for several.
@@ -288,4 +359,6 @@ def annotate(
         annotation = vipe_core.annotate("clip.mp4")
         annotation.world_from_cam, annotation.camera.fov_x_deg, annotation.quality.reliable
     """
-    return Annotator(preset, camera, device).annotate(video, masks=masks, scale_from=scale_from, progress=progress)
+    return Annotator(preset, camera, device).annotate(
+        video, masks=masks, scale_from=scale_from, calibration=calibration, progress=progress
+    )

@@ -27,6 +27,7 @@ from vipe_core.depth.scale import (
 from vipe_core.depth.types import SceneMap
 from vipe_core.errors import ScaleUnobservable
 from vipe_core.priors.protocols import MetricDepth
+from vipe_core.video.resampled import ResampledView
 from vipe_core.video.source import FrameSource
 
 # Pictures of a shot that are given to metric depth: their errors are far from independent, so more say little more.
@@ -145,7 +146,12 @@ def _from_known(scene: SceneMap, source: FrameSource, known: KnownLength) -> lis
         if known.place is not None:
             x, y, frame = known.place
             size = (source.info.width, source.info.height)
-            return [scale_from_pixel(scene, (x, y), frame, known.metres, size)]
+            at = source.seen_at(x, y) if isinstance(source, ResampledView) else (x, y)
+            if at is None:
+                raise ScaleUnobservable(
+                    f"pixel ({x:g}, {y:g}) is not in the picture, or the calibration has no ray there"
+                )
+            return [scale_from_pixel(scene, at, frame, known.metres, size)]
         if known.kind == "path":
             return [scale_from_path(scene, known.metres)]
         return [scale_from_height(scene, shot, known.metres) for shot in shots_of(scene)]

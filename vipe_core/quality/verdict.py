@@ -88,9 +88,11 @@ def assess(result: SlamResult, settings: SlamSettings, source_width: int) -> Qua
         reasons.append("interpolated_frames")
         fatal = fatal or interpolated > _MOSTLY_INTERPOLATED
     low_deg, high_deg = _fov_interval_deg(result)
-    # Lines may tell the focal length of a camera that never moves, but nothing then confirms it.
+    # Lines may tell the focal length of a camera that never moves, but nothing then confirms it. A given one needs that
+    # not.
+    unconfirmed = result.motion == "static" and result.focal_sigma_ratio > 0
     doubt_deg = 2 * settings.fov_doubt_ratio * result.camera.fov_x_deg
-    if not panorama and (result.motion == "static" or high_deg - low_deg > doubt_deg):
+    if not panorama and (unconfirmed or high_deg - low_deg > doubt_deg):
         reasons.append("focal_unobservable")
     reliable: Reliability = "no" if fatal else "doubtful" if reasons else "yes"
     to_source = source_width / result.working.width

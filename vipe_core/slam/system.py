@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from vipe_core.ba.problem import Grid
 from vipe_core.cameras import Camera
+from vipe_core.cameras.calibration import Calibration
 from vipe_core.errors import ConfigError
 from vipe_core.geometry.arrays import inverse
 from vipe_core.priors.protocols import IntrinsicsEstimate, PriorFamily
@@ -28,6 +29,9 @@ from vipe_core.video.source import FrameSource
 
 # How closely the later shots hold the focal length that the main one found: they share a camera.
 _SAME_FOCAL_SIGMA = 1e-4
+# How far from a calibration that is only a starting point the focal length may be: another copy of the lens, another
+# setting of its focus.
+_CALIBRATED_SIGMA = 0.02
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,10 +90,11 @@ class Slam:
         self._settings = settings
         self._device = device
 
-    def run(self, source: FrameSource, report: Report) -> SlamResult:
+    def run(self, source: FrameSource, report: Report, known: Calibration | None = None) -> SlamResult:
         """Pose every frame of the video.
 
         Args:
+            known: The camera at the size of the source, `pinhole` or `mei`; estimated from the video if None.
             report: Told the stage and how far it is; what it raises ends the run.
 
         Raises:
@@ -100,18 +105,26 @@ class Slam:
         refiner = self._priors.refiner
         offset_px = None if refiner is None else refiner.offset_px
         info = source.info
-        size = working_size(info.width, info.height, settings.working_area_px, offset_px=offset_px)
+        aspect = info.pixel_aspect if known is None else known.camera.params[1] / known.camera.params[0]
+        size = working_size(
+            info.width, info.height, settings.working_area_px, offset_px=offset_px, pixel_aspect=aspect
+        )
         frames = EncodedFrames(source, size, self._priors.matcher, settings.frame_cache_bytes)
         with clock("scan"):
             selection = select_keyframes(frames, size, settings, report)
         main = max(range(len(selection.shots)), key=lambda number: len(selection.shots[number].keyframes))
         with clock("intrinsics"):
-            estimate = self._initial_camera(source, selection, selection.shots[main], size)
+            if known is None:
+                estimate = self._initial_camera(source, selection, selection.shots[main], size)
+            else:
+                sigma = 0.0 if known.use == "fixed" else _CALIBRATED_SIGMA
+                estimate = IntrinsicsEstimate(known.camera.resized(*size.size), sigma, 0)
             report("intrinsics", 1, 1)
         mapper = ShotMapper(
             self._priors, settings, self._device, size, estimate.camera.model, selection.timestamps_s, clock
         )
-        maps = self._map(mapper, selection, main, estimate, report)
+        held = known is not None and known.use == "fixed"
+        maps = self._map(mapper, selection, main, estimate, held, report)
         with clock("infill"):
             tracks_only = None if settings.terms.dense_flow else self._priors.tracker
             aligner = self._priors.aligner if settings.terms.dense_flow else None
@@ -145,12 +158,18 @@ class Slam:
         )
 
     def _map(
-        self, mapper: ShotMapper, selection: Selection, main: int, estimate: IntrinsicsEstimate, report: Report
+        self,
+        mapper: ShotMapper,
+        selection: Selection,
+        main: int,
+        estimate: IntrinsicsEstimate,
+        held: bool,
+        report: Report,
     ) -> list[ShotMap]:
         """The maps of all shots, in order. The main one finds the focal length, the others take it over."""
         intrinsics = estimate.camera.index_params()
         rivals = tuple(math.log(rival_px) for rival_px in estimate.rivals_px)
-        prior = FocalPrior(math.log(estimate.camera.focal_px), estimate.log_focal_sigma, rivals)
+        prior = FocalPrior(math.log(estimate.camera.focal_px), estimate.log_focal_sigma, rivals, held=held)
         maps: dict[int, ShotMap] = {}
         done = 0
         for number in [main, *(k for k in range(len(selection.shots)) if k != main)]:
@@ -168,7 +187,7 @@ class Slam:
 
             maps[number] = mapper.run(shot, intrinsics, prior, tracked, adjusting)
             done += shot.stop - shot.start
-            if number == main:
+            if number == main and not held:
                 intrinsics = maps[main].keyframes.intrinsics
                 prior = FocalPrior(math.log(float(intrinsics[0])), _SAME_FOCAL_SIGMA, same_lens=True)
         report("backend", 1, 1)
@@ -177,15 +196,17 @@ class Slam:
     def _initial_camera(
         self, source: FrameSource, selection: Selection, shot: Shot, size: WorkingSize
     ) -> IntrinsicsEstimate:
-        """The initial camera at the working size, with pixels that are square in the source video."""
+        """The initial camera at the working size, with the source video's shape of pixels."""
         sample = [frame for frame in selection.sample if shot.start <= frame.index < shot.stop]
         estimate = self._priors.intrinsics.estimate(sample, size.grid)
-        scale_x, scale_y = size.width / source.info.width, size.height / source.info.height
+        # In units of a source pixel's height, that pixel is `aspect` wide.
+        aspect = source.info.pixel_aspect
+        scale_x, scale_y = size.width / (source.info.width * aspect), size.height / source.info.height
         focal_px = estimate.camera.focal_px / math.sqrt(scale_x * scale_y)
         width, height = source.info.width, source.info.height
         shape = estimate.camera.params[4:]
-        square = Camera(estimate.camera.model, (focal_px, focal_px, width / 2, height / 2, *shape), width, height)
-        camera = square.resized(size.width, size.height)
+        own = (focal_px / aspect, focal_px, width / 2, height / 2, *shape)
+        camera = Camera(estimate.camera.model, own, width, height).resized(size.width, size.height)
         scale = camera.focal_px / estimate.camera.focal_px
         rivals_px = tuple(rival_px * scale for rival_px in estimate.rivals_px)
         return IntrinsicsEstimate(camera, estimate.log_focal_sigma, estimate.num_pairs, rivals_px)

@@ -13,6 +13,8 @@ from vipe_core.priors.protocols import WorkingFrame
 from vipe_core.video.source import Frame
 
 _MIN_CELLS = 4
+# Pixels this near to square, on a logarithmic scale, are taken for square ones: calibrated cameras are that far off.
+_SQUARE = 0.02
 # Rows and columns at the border without a brighter pixel are a bar, not a picture: black is 16 in broadcast levels, and
 # an encoder's ringing adds a few.
 _BAR_LEVEL = 24
@@ -46,11 +48,24 @@ class WorkingSize:
         return self.width, self.height
 
 
-def working_size(width: int, height: int, area_px: int, stride: int = 8, offset_px: float | None = None) -> WorkingSize:
+def working_size(
+    width: int,
+    height: int,
+    area_px: int,
+    stride: int = 8,
+    offset_px: float | None = None,
+    pixel_aspect: float = 1.0,
+) -> WorkingSize:
     """Working size of a video of `width` x `height` pixels: about `area_px`, whole cells, never enlarged.
 
-    A video smaller than a few cells is enlarged to them, the least that a grid needs.
+    A video smaller than a few cells is enlarged to them, the least that a grid needs. Working pixels are square: of
+    pixels that are not, the longer side is reduced.
+
+    Args:
+        pixel_aspect: Width of a pixel over its height.
     """
+    if abs(math.log(pixel_aspect)) > _SQUARE:
+        width, height = round(width * min(1.0, pixel_aspect)), round(height / max(1.0, pixel_aspect))
     scale = min(1.0, math.sqrt(area_px / (width * height)))
 
     def whole_cells(length: int) -> int:

@@ -48,6 +48,8 @@ _IMAGE_HEADS = (b"\x89PNG", b"\xff\xd8\xff", b"BM", b"II*\0", b"MM\0*", b"8BPS",
 _EXACT = Interpolation.ACCURATE_RND | Interpolation.FULL_CHR_H_INT
 
 DEFAULT_FPS = 30.0
+# Anamorphic lenses and old tapes stay below 2.4; beyond this it is a slip.
+_MAX_PIXEL_ASPECT = 4.0
 # A step back by more than this is a new clock (a spliced transport stream), not a jittering one.
 _CLOCK_RESET_S = 1.0
 
@@ -65,6 +67,7 @@ class Description:
     codec: str
     pixel_format: str
     spherical: bool
+    pixel_aspect: float
 
 
 @dataclass(slots=True)
@@ -154,6 +157,7 @@ def describe(media: OpenedMedia, limits: Limits) -> Description:
             codec=stream.codec_context.name,
             pixel_format=first.format.name,
             spherical=_is_spherical(first),
+            pixel_aspect=_pixel_aspect(stream, converter.rotation_deg(first)),
         )
 
 
@@ -388,6 +392,15 @@ def _fps(stream: VideoStream) -> float:
         if rate is not None and 0 < rate <= 1000:
             return float(rate)
     return DEFAULT_FPS
+
+
+def _pixel_aspect(stream: VideoStream, rotation_deg: int) -> float:
+    """Width over height of a pixel of the upright picture; 1 where nothing sensible is stated."""
+    stated = stream.sample_aspect_ratio
+    aspect = 1.0 if stated is None or stated <= 0 else float(stated)
+    if not 1 / _MAX_PIXEL_ASPECT <= aspect <= _MAX_PIXEL_ASPECT:
+        return 1.0
+    return 1 / aspect if rotation_deg % 180 else aspect
 
 
 def _duration_s(container: InputContainer, stream: VideoStream) -> float | None:

@@ -18,6 +18,7 @@ class VideoInfo:
         num_frames_hint: Frame count as the container states it, or None; decoding has the last word.
         fps: Average frame rate (30 for a directory of images).
         rotation_deg: Clockwise rotation that was applied to make the picture upright: 0, 90, 180 or 270.
+        pixel_aspect: Width of a pixel over its height, as the container states it.
         frame_names: Names of the files that the pictures are from, without suffix; empty for a video.
         spherical: Whether the container says that the pictures are equirectangular panoramas.
     """
@@ -35,6 +36,7 @@ class VideoInfo:
     size_bytes: int
     frame_names: tuple[str, ...] = ()
     spherical: bool = False
+    pixel_aspect: float = 1.0
 
 
 @dataclass(frozen=True, slots=True)

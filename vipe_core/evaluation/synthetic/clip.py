@@ -84,12 +84,33 @@ def render_rig(
 
 
 def sample_camera(model: CameraModel, width: int, height: int) -> Camera:
-    """A typical camera of each model: pinhole with 62 degrees, mei with about 115 degrees, the full panorama."""
+    """A typical camera of each model: pinhole with 62 degrees, mei with about 115 degrees, the full panorama, an action
+    camera's barrel distortion (opencv, 86 degrees) and a fisheye of 149 degrees."""
     if model == "pinhole":
         return Camera.pinhole_from_fov(62.0, width, height)
     if model == "mei":
         focal_px = 0.70 * width
         return Camera("mei", (focal_px, focal_px, width / 2, height / 2, 0.66), width, height)
+    if model == "opencv":
+        lens = (
+            0.66 * width,
+            0.66 * width,
+            0.51 * width,
+            0.49 * height,
+            -0.28,
+            0.09,
+            4e-4,
+            -3e-4,
+            -0.014,
+            0.0,
+            0.0,
+            0.0,
+        )
+        return Camera("opencv", lens, width, height)
+    if model == "opencv_fisheye":
+        focal_px = 0.38 * width
+        fisheye = (focal_px, focal_px, 0.49 * width, 0.51 * height, 0.02, -0.008, 0.001, -1e-4)
+        return Camera("opencv_fisheye", fisheye, width, height)
     return Camera("equirect", (), width, height)
 
 

@@ -15,6 +15,8 @@ from numpy.typing import NDArray
 from vipe_core.cameras import Camera
 
 _TILE_PX = 16
+_FIXED_POINT_STEPS = 100
+_BISECTIONS = 52
 
 
 def unit_rays(camera: Camera, u: NDArray[np.float64], v: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -25,8 +27,14 @@ def unit_rays(camera: Camera, u: NDArray[np.float64], v: NDArray[np.float64]) ->
         return np.stack([np.sin(phi) * np.sin(theta), -np.cos(phi), np.sin(phi) * np.cos(theta)], axis=-1)
     a = (u - camera.params[2]) / camera.params[0]
     b = (v - camera.params[3]) / camera.params[1]
+    if camera.model == "opencv":
+        a, b = _straight(camera.params[4:], a, b)
+    elif camera.model == "opencv_fisheye":
+        angle = _angles(camera.params[4:], np.hypot(a, b))
+        turn = np.arctan2(b, a)
+        return np.stack([np.sin(angle) * np.cos(turn), np.sin(angle) * np.sin(turn), np.cos(angle)], axis=-1)
     rho2 = a * a + b * b
-    if camera.model == "pinhole":
+    if camera.model in ("pinhole", "opencv"):
         return np.stack([a, b, np.ones_like(a)], axis=-1) / np.sqrt(1 + rho2)[..., None]
     alpha = camera.params[4]
     # On the unit sphere the point is (a s, b s, s - alpha); beyond the image circle of alpha > 1 the root is clamped.
@@ -34,6 +42,34 @@ def unit_rays(camera: Camera, u: NDArray[np.float64], v: NDArray[np.float64]) ->
     rays = np.stack([a * scale, b * scale, scale - alpha], axis=-1)
     unit: NDArray[np.float64] = rays / np.linalg.norm(rays, axis=-1, keepdims=True)
     return unit
+
+
+def _straight(
+    coefficients: tuple[float, ...], u: NDArray[np.float64], v: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Slopes that radial-tangential distortion shows at `u`, `v` (focal lengths), by fixed-point iteration.
+
+    It converges wherever the distortion is mild enough for a lens that somebody would sell.
+    """
+    k1, k2, p1, p2, k3, k4, k5, k6 = coefficients
+    a, b = u, v
+    for _ in range(_FIXED_POINT_STEPS):
+        q = a * a + b * b
+        stretch = (1 + k1 * q + k2 * q**2 + k3 * q**3) / (1 + k4 * q + k5 * q**2 + k6 * q**3)
+        da, db = 2 * p1 * a * b + p2 * (q + 2 * a * a), p1 * (q + 2 * b * b) + 2 * p2 * a * b
+        a, b = (u - da) / stretch, (v - db) / stretch
+    return a, b
+
+
+def _angles(coefficients: tuple[float, ...], radius: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Angles from the axis that a Kannala-Brandt lens shows at a radius (focal lengths), by bisection."""
+    low, high = np.zeros_like(radius), np.full_like(radius, math.pi)
+    for _ in range(_BISECTIONS):
+        middle = 0.5 * (low + high)
+        powers = sum(k * middle ** (2 * n + 3) for n, k in enumerate(coefficients))
+        beyond = middle + powers > radius
+        low, high = np.where(beyond, low, middle), np.where(beyond, middle, high)
+    return 0.5 * (low + high)
 
 
 @dataclass(frozen=True, slots=True)
