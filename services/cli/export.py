@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from services.domain.models import Attribute
     from vipe_core.formats import Artifacts
 
-Format = Literal["npz", "png16", "video", "ply", "mesh", "colmap", "nerfstudio"]
+Format = Literal["npz", "png16", "video", "ply", "mesh", "colmap", "nerfstudio", "pictures"]
 FORMATS: tuple[Format, ...] = get_args(Format)
 
 
@@ -26,20 +26,32 @@ def export(
         typer.Option(
             "--format",
             help="npz: arrays. png16: 16-bit depth. video: coloured depth. ply: fused points. mesh: fused surface. "
-            "colmap: sparse model. nerfstudio: transforms.json.",
+            "colmap: sparse model. nerfstudio: transforms.json. pictures: frames and camera.json.",
         ),
     ] = "npz",
     key: Annotated[list[str] | None, typer.Option("--key", help="Only these videos.")] = None,
     depth_stride: Annotated[int, typer.Option(min=1, help="npz: keep every n-th depth pixel per axis.")] = 4,
     beside_rgb: Annotated[bool, typer.Option("--beside-rgb", help="video: the frames to the left.")] = False,
     text: Annotated[bool, typer.Option("--text", help="colmap: write .txt instead of .bin.")] = False,
-    every: Annotated[int, typer.Option(min=1, help="ply, mesh, colmap, nerfstudio: use every n-th frame.")] = 1,
+    every: Annotated[
+        int, typer.Option(min=1, help="ply, mesh, colmap, nerfstudio, pictures: use every n-th frame.")
+    ] = 1,
     voxel: Annotated[
         float | None,
         typer.Option(min=1e-9, help="Distance of points in units of the world; by default a share of the depth."),
     ] = None,
     min_confidence: Annotated[
         float | None, typer.Option(min=0, max=1, help="Depth of less confidence is no part of a cloud or a mesh.")
+    ] = None,
+    rectify: Annotated[
+        bool,
+        typer.Option(
+            "--rectify", help="As a pinhole sees it: straight lines are straight. With the maps, rectification.npz."
+        ),
+    ] = False,
+    fov: Annotated[
+        float | None,
+        typer.Option(metavar="DEG", help="--rectify: horizontal field of view; by default the camera's, 100 at most."),
     ] = None,
     endpoint: Endpoint = None,
 ) -> None:
@@ -48,13 +60,20 @@ def export(
     Clouds and meshes leave out what moves. The scale of everything is that of the poses.
     """
     from vipe_core.formats.fused import MIN_CONFIDENCE
+    from vipe_core.formats.rectified import MAPS_FILE, rectified, write_maps
 
     least = MIN_CONFIDENCE if min_confidence is None else min_confidence
     # Without the pictures where they are not needed: they are most of what would be fetched.
     attributes: tuple[Attribute, ...] | None = ("pose", "intrinsics", "depth") if format in ("npz", "png16") else None
+    if fov is not None and not rectify:
+        raise typer.BadParameter("the field of view is that of --rectify", param_hint="--fov")
     for artifacts in sequences(source, key, endpoint, attributes):
+        if rectify:
+            artifacts = rectified(artifacts, fov)
         out = destination / f"{artifacts.name}{_SUFFIXES.get(format, '')}"
         typer.echo(_write(artifacts, out, format, depth_stride, beside_rgb, text, every, voxel, least))
+        if rectify:
+            write_maps(artifacts, out / MAPS_FILE if out.is_dir() else out.with_name(f"{artifacts.name}_{MAPS_FILE}"))
 
 
 # What has no suffix is a folder.
@@ -77,10 +96,11 @@ def _write(
     from vipe_core.formats.fused import fuse_cloud, fuse_mesh
     from vipe_core.formats.nerfstudio import export_nerfstudio
     from vipe_core.formats.ply import write_ply
+    from vipe_core.formats.rectified import export_pictures
 
     match format:
         case "npz":
-            return export_npz(artifacts.root, artifacts.name, out, depth_stride=depth_stride)
+            return export_npz(artifacts, out, depth_stride=depth_stride)
         case "png16":
             return export_png16(artifacts, out)
         case "video":
@@ -97,6 +117,8 @@ def _write(
             return export_colmap(artifacts, out, text=text, step=step, voxel=voxel, min_confidence=least)
         case "nerfstudio":
             return export_nerfstudio(artifacts, out, step=step, voxel=voxel, min_confidence=least)
+        case "pictures":
+            return export_pictures(artifacts, out, step=step)
 
 
 def _comments(artifacts: Artifacts) -> list[str]:

@@ -61,7 +61,7 @@ def test_masks_come_back_as_they_were(store: DirectoryStore, tmp_path: Path) -> 
             assert len(masks) == count
             for index, mask in enumerate(masks):
                 np.testing.assert_array_equal(mask, mask_of(index))
-        exported = export_npz(tmp_path / "u", key, tmp_path / f"{key}.npz")
+        exported = export_npz(read_artifacts(tmp_path / "u", key), tmp_path / f"{key}.npz")
         with np.load(exported) as arrays:
             assert len(arrays["depth"]) == count
     unpack(store, tmp_path / "m", attributes=["mask"])

@@ -10,7 +10,7 @@ from artifact_samples import CAMERAS, HEIGHT, WIDTH, depth_of, make_annotation
 from hypothesis import given
 from hypothesis import strategies as st
 
-from vipe_core.formats import export_npz, write_artifacts
+from vipe_core.formats import export_npz, read_artifacts, write_artifacts
 from vipe_core.formats.scorer_npz import reduce_depth
 
 
@@ -18,7 +18,7 @@ from vipe_core.formats.scorer_npz import reduce_depth
 def test_keys_types_and_values(tmp_path: Path, model: str) -> None:
     annotation = make_annotation(model)
     write_artifacts(annotation, tmp_path)
-    out = export_npz(tmp_path, "clip", tmp_path / "out" / "clip.npz")
+    out = export_npz(read_artifacts(tmp_path, "clip"), tmp_path / "out" / "clip.npz")
     with np.load(out, allow_pickle=False) as file:
         arrays = {key: file[key] for key in file.files}
     assert np.allclose(arrays["cam_to_world"], annotation.world_from_cam, atol=1e-6)
@@ -32,13 +32,13 @@ def test_keys_types_and_values(tmp_path: Path, model: str) -> None:
 
 def test_full_resolution_and_no_depth(tmp_path: Path) -> None:
     write_artifacts(make_annotation(), tmp_path, attributes=("pose", "intrinsics", "depth"))
-    with np.load(export_npz(tmp_path, "clip", tmp_path / "full.npz", depth_stride=1)) as file:
+    with np.load(export_npz(read_artifacts(tmp_path, "clip"), tmp_path / "full.npz", depth_stride=1)) as file:
         assert np.array_equal(file["depth"][2], depth_of(2).astype(np.float16))
     (tmp_path / "depth/clip.zip").unlink()
-    with np.load(export_npz(tmp_path, "clip", tmp_path / "none.npz")) as file:
+    with np.load(export_npz(read_artifacts(tmp_path, "clip"), tmp_path / "none.npz")) as file:
         assert "depth" not in file.files
     with pytest.raises(ValueError, match="stride"):
-        export_npz(tmp_path, "clip", tmp_path / "x.npz", depth_stride=0)
+        export_npz(read_artifacts(tmp_path, "clip"), tmp_path / "x.npz", depth_stride=0)
     assert list(tmp_path.glob(".*")) == []
 
 

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vipe_core.cameras.camera import Camera
+from vipe_core.cameras.pixel_map import PixelMap
 
 Array = NDArray[Any]
 
@@ -25,7 +26,6 @@ _PINHOLE_ANGLE_DEG = 55.0
 # the corners is not worth more.
 _LARGEST = 2.0
 _GRID = 49
-_ROWS_AT_ONCE = 256
 
 
 @dataclass(frozen=True)
@@ -60,23 +60,14 @@ class Resampling:
         return cls(lens, Camera(ideal.model, params, int(size[0]), int(size[1])))
 
     @cached_property
-    def ideal_map(self) -> NDArray[np.float32]:
-        """(2, h, w) index coordinates (x, y) in the lens's picture of every pixel of the ideal one; far outside where
-        the lens sees nothing."""
-        return _mapped(self.ideal, self.lens)
+    def forward(self) -> PixelMap:
+        """From the lens's pictures to the ideal ones."""
+        return PixelMap(self.lens, self.ideal)
 
     @cached_property
-    def lens_map(self) -> NDArray[np.float32]:
-        """(2, h, w) index coordinates in the ideal picture of every pixel of the lens's; far outside where it has no
-        ray."""
-        return _mapped(self.lens, self.ideal)
-
-    @cached_property
-    def outside(self) -> NDArray[np.bool_]:
-        """(h, w) pixels of the ideal picture that the lens's picture does not show, but for a seam of a pixel."""
-        x, y = self.ideal_map
-        inside = (x > -1) & (y > -1) & (x < self.lens.width) & (y < self.lens.height)
-        return np.asarray(~inside)
+    def back(self) -> PixelMap:
+        """From the ideal pictures, and maps of them, to the lens's."""
+        return PixelMap(self.ideal, self.lens)
 
     def ideal_px(self, px: Array) -> NDArray[np.float64]:
         """(..., 2) index coordinates in the lens's picture -> (..., 2) in the ideal one, NaN where there are none."""
@@ -132,16 +123,3 @@ def _nearest_unified(lens: Camera, angle: Array) -> tuple[float, float]:
     alpha = float(np.clip(np.linalg.lstsq(design, radius * np.cos(at), rcond=None)[0][1], 0.0, 1.0))
     sine = np.sin(at)
     return float((radius * (np.cos(at) + alpha) * sine).sum() / (sine * sine).sum()), alpha
-
-
-def _mapped(of: Camera, into: Camera) -> NDArray[np.float32]:
-    """(2, h, w) where `into` sees what the pixels of `of` see."""
-    found = np.empty((2, of.height, of.width), np.float32)
-    for top in range(0, of.height, _ROWS_AT_ONCE):
-        bottom = min(top + _ROWS_AT_ONCE, of.height)
-        v, u = np.meshgrid(np.arange(top, bottom), np.arange(of.width), indexing="ij")
-        px = np.stack((u, v), axis=-1)
-        at, seen = into.project(of.unproject(px))
-        at = np.where((seen & of.has_ray(px))[..., None], np.clip(at, -1e6, 1e6), -1e6)
-        found[:, top:bottom] = np.moveaxis(at, -1, 0)
-    return found

@@ -1,7 +1,7 @@
 """Annotations on disk: ViPE's artifact layout, the depth codec, and exports.
 
-What needs the fused surface of a sequence (`fused`, `colmap`, `nerfstudio`, `ply`) is imported from its module: workers
-and readers of plain files do without it.
+What needs the fused surface of a sequence (`fused`, `colmap`, `nerfstudio`, `ply`, `rectified`) is imported from its
+module: workers and readers of plain files do without it.
 """
 
 from vipe_core.formats.artifacts import ArtifactPaths, write_artifacts

@@ -7,7 +7,7 @@ import re
 import zipfile
 import zlib
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import TracebackType
 from typing import IO, Any, ClassVar, Generic, Self, TypeVar
@@ -80,6 +80,7 @@ class FrameZipReader(_FrameZip, ABC, Generic[Pixel]):
         suffix: Of the members' names, without the dot.
         kind: What messages call a picture.
         max_bytes: A larger member is refused before it is unpacked.
+        resample: What every picture goes through once it is read; None leaves it as it is.
 
     Raises:
         FormatError: Not a zip, or its members are not consecutive pictures from 0 on.
@@ -91,6 +92,7 @@ class FrameZipReader(_FrameZip, ABC, Generic[Pixel]):
 
     def __init__(self, source: str | Path | IO[bytes], label: str | None = None) -> None:
         """Open a file, or bytes that messages call `label`."""
+        self.resample: Callable[[NDArray[Pixel]], NDArray[Pixel]] | None = None
         self._name = label or (Path(source).name if isinstance(source, (str, Path)) else "archive")
         try:
             self._zip = zipfile.ZipFile(source)
@@ -128,7 +130,8 @@ class FrameZipReader(_FrameZip, ABC, Generic[Pixel]):
             data = self._zip.read(member)
         except (zipfile.BadZipFile, zlib.error, OSError, EOFError, ValueError, RuntimeError, lzma.LZMAError) as error:
             raise FormatError(f"{label}: the member is damaged; write the artifact again") from error
-        return self._decoded(data, label)
+        picture = self._decoded(data, label)
+        return picture if self.resample is None else self.resample(picture)
 
     @abstractmethod
     def _decoded(self, data: bytes, label: str) -> NDArray[Pixel]:

@@ -13,7 +13,6 @@ from vipe_core.annotation import MEASURED, MOVING
 from vipe_core.errors import FormatError
 from vipe_core.formats.reading import Artifacts
 from vipe_core.fusion import SurfaceView, surface_weight
-from vipe_core.video import open_source
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,14 +71,14 @@ def read_frames(
         confidence = stack.enter_context(artifacts.open_confidence()) if artifacts.has_confidence else None
         kind = stack.enter_context(artifacts.open_kind()) if artifacts.has_confidence else None
         mask = stack.enter_context(artifacts.open_mask()) if artifacts.has_mask else None
-        stream = stack.enter_context(closing(open_source(artifacts.rgb_path).frames(stop=artifacts.num_frames)))
+        stream = stack.enter_context(closing(artifacts.pictures()))
         index = -1
         for index, picture in enumerate(stream):
             if wanted is not None and not wanted(index):
                 continue
             frame = ArtifactFrame(
                 index,
-                picture.rgb,
+                picture,
                 depth.read(index),
                 confidence.read(index) if confidence is not None else None,
                 kind.read(index) if kind is not None else None,

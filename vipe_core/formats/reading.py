@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 import zipfile
 import zlib
+from collections.abc import Callable, Generator
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
@@ -12,17 +14,21 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from vipe_core.annotation import DepthKind
+from vipe_core.annotation import UNOBSERVED, DepthKind
 from vipe_core.cameras import Camera, CameraModel
+from vipe_core.cameras.pixel_map import PixelMap
 from vipe_core.errors import ConfigError, FormatError, VipeError
-from vipe_core.formats.artifacts import DISK_DEPTH_KINDS
+from vipe_core.formats.artifacts import DISK_DEPTH_KINDS, disk_depth_factor
 from vipe_core.formats.depth_zip import DepthZipReader
 from vipe_core.formats.frame_zip import FrameZipReader
 from vipe_core.formats.layout import artifact_path, info_path
 from vipe_core.formats.png_zip import ConfidenceZipReader, KindZipReader, MaskZipReader
+from vipe_core.video.opening import open_source
 from vipe_core.video.probe import probe
 
 Reader = TypeVar("Reader", bound=FrameZipReader[Any])
+Sample = TypeVar("Sample", bound=np.generic)
+
 
 # Ten million poses.
 _MAX_ARRAY_BYTES = 10_000_000 * 16 * 8
@@ -49,6 +55,8 @@ class Artifacts:
         depth_kind: `ray` for panoramas, else `z`.
         timestamps_s: (N,) float64, or None where no info file says.
         info: Our description of the sequence; empty for directories of the original tool.
+        seen_by: How the pictures on disk become those of `camera`, where that is not the one they were taken with: see
+            `rectified.py`.
     """
 
     root: Path
@@ -60,6 +68,7 @@ class Artifacts:
     depth_kind: DepthKind
     timestamps_s: NDArray[np.float64] | None
     info: dict[str, Any]
+    seen_by: PixelMap | None = None
 
     @property
     def num_frames(self) -> int:
@@ -83,33 +92,64 @@ class Artifacts:
         path = self._path("rgb", "mp4")
         return path if path.is_file() else None
 
+    def pictures(self) -> Generator[NDArray[np.uint8], None, None]:
+        """(H, W, 3) uint8 of every pose, in order. Closing the generator ends the decoder.
+
+        Raises:
+            FormatError: No rgb.
+            InputError, DecodeError: It cannot be decoded.
+        """
+        if self.rgb_path is None:
+            raise FormatError(f"{self.name}: the attribute rgb is needed and is not there")
+        with closing(open_source(self.rgb_path).frames(stop=self.num_frames)) as frames:
+            for frame in frames:
+                yield frame.rgb if self.seen_by is None else _in_black(self.seen_by, frame.rgb)
+
     def open_depth(self) -> DepthZipReader:
         """Depth maps, one per pose; close it after use.
 
         Raises:
             FormatError: No depth, a damaged archive, or another number of maps than poses. So do the others.
         """
-        return self._checked(DepthZipReader(self._path("depth", "zip")))
+        return self._checked(DepthZipReader(self._path("depth", "zip")), self._depth)
 
     def open_mask(self) -> MaskZipReader:
         """Masks of instance ids, one per pose; close it after use."""
-        return self._checked(MaskZipReader(self._path("mask", "zip")))
+        return self._checked(MaskZipReader(self._path("mask", "zip")), self._nearest)
 
     def open_confidence(self) -> ConfidenceZipReader:
         """Confidence in 0..1, one map per pose; close it after use."""
-        return self._checked(ConfidenceZipReader(self._path("confidence", "zip")))
+        return self._checked(ConfidenceZipReader(self._path("confidence", "zip")), self._nearest)
 
     def open_kind(self) -> KindZipReader:
         """Classes of `annotation.DEPTH_KINDS`, one map per pose; close it after use."""
-        return self._checked(KindZipReader(self._path("confidence", "kind.zip")))
+        return self._checked(KindZipReader(self._path("confidence", "kind.zip")), self._kind)
 
     def _path(self, attribute: str, suffix: str) -> Path:
         return artifact_path(self.root, self.name, attribute, suffix)
 
-    def _checked(self, reader: Reader) -> Reader:
+    def _depth(self, depth: NDArray[np.float32]) -> NDArray[np.float32]:
+        assert self.seen_by is not None
+        resampled = self.seen_by.depth(depth)
+        if DISK_DEPTH_KINDS[self.seen_by.source.model] == self.depth_kind:
+            return resampled
+        factor = disk_depth_factor(self.camera, DISK_DEPTH_KINDS[self.seen_by.source.model])
+        return resampled if factor is None else resampled * factor
+
+    def _nearest(self, picture: NDArray[Sample]) -> NDArray[Sample]:
+        assert self.seen_by is not None
+        return self.seen_by.nearest(picture)
+
+    def _kind(self, picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        assert self.seen_by is not None
+        return self.seen_by.nearest(picture, UNOBSERVED)
+
+    def _checked(self, reader: Reader, resample: Callable[[NDArray[Any]], NDArray[Any]]) -> Reader:
         if len(reader) != self.num_frames:
             reader.close()
             raise FormatError(f"{self.name}: {len(reader)} {reader.kind}s for {self.num_frames} poses")
+        if self.seen_by is not None:
+            reader.resample = resample
         return reader
 
 
@@ -205,6 +245,12 @@ def _read_info(path: Path, num_frames: int) -> dict[str, Any]:
     if not all(isinstance(stamp, (int, float)) for stamp in stamps):
         raise FormatError(f"{path.parent.name}/{path.name}: `timestamps_s` must be numbers")
     return info
+
+
+def _in_black(seen_by: PixelMap, rgb: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    picture = seen_by.colours(rgb)
+    picture[seen_by.outside] = 0
+    return picture
 
 
 def _with_all_digits(params: tuple[float, ...], stated: Any) -> tuple[float, ...]:

@@ -16,27 +16,26 @@ from numpy.typing import NDArray
 
 from vipe_core.formats.atomic import complete_file
 from vipe_core.formats.exr import MAX_DEPTH
-from vipe_core.formats.reading import Artifacts, read_artifacts
+from vipe_core.formats.reading import Artifacts
 
 # A smaller pixel exists where at least this share of its area has a value.
 _MIN_SHARE = 0.25
 
 
-def export_npz(root: str | Path, name: str, out: str | Path, *, depth_stride: int = 4) -> Path:
-    """Write the sequence `name` below `root` to `out`; holds all depth maps in memory at the reduced size.
+def export_npz(artifacts: Artifacts, out: str | Path, *, depth_stride: int = 4) -> Path:
+    """Write a sequence to `out`; holds all depth maps in memory at the reduced size.
 
     Args:
         out: File to write, ending in `.npz`.
         depth_stride: Depth is reduced by this factor, averaged in inverse depth; 1 keeps it as it is.
 
     Raises:
-        FormatError: The artifacts are not readable.
+        FormatError: The depth is not readable.
         ValueError: A stride below 1, or another suffix.
     """
     out = Path(out)
     if depth_stride < 1 or out.suffix != ".npz":
         raise ValueError(f"need a stride of at least 1 and an .npz file, got {depth_stride} and {out.name}")
-    artifacts = read_artifacts(root, name)
     arrays: dict[str, Any] = {
         "cam_to_world": artifacts.world_from_cam,
         "intrinsics": artifacts.intrinsics,

@@ -296,15 +296,16 @@ def _final_camera(found: Camera, given: Calibration | None, source: FrameSource)
 
 def _taken_back(stream: Generator[DepthFrame, None, None], view: ResampledView) -> Generator[DepthFrame, None, None]:
     """Frames of resampled pictures as frames of the pictures themselves."""
+    back = view.resampling.back
     with closing(stream) as frames, closing(view.source.frames()) as pictures:
         for frame, picture in zip(frames, pictures, strict=False):
             yield DepthFrame(
                 frame.index,
                 picture.rgb,
-                view.depth_back(frame.depth),
-                view.back(frame.confidence),
-                view.back(frame.kind, UNOBSERVED),
-                view.back(frame.moving.view(np.uint8)).view(np.bool_),
+                back.depth(frame.depth),
+                back.nearest(frame.confidence),
+                back.nearest(frame.kind, UNOBSERVED),
+                back.nearest(frame.moving.view(np.uint8)).view(np.bool_),
             )
 
 
