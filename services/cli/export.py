@@ -53,6 +53,9 @@ def export(
         float | None,
         typer.Option(metavar="DEG", help="--rectify: horizontal field of view; by default the camera's, 100 at most."),
     ] = None,
+    shot: Annotated[
+        int | None, typer.Option(min=1, help="Of a video with cuts, this shot only; the first is 1.")
+    ] = None,
     endpoint: Endpoint = None,
 ) -> None:
     """Export each video to a file or a folder of another format.
@@ -68,12 +71,14 @@ def export(
     if fov is not None and not rectify:
         raise typer.BadParameter("the field of view is that of --rectify", param_hint="--fov")
     for artifacts in sequences(source, key, endpoint, attributes):
+        chosen = artifacts if shot is None else artifacts.shot(shot)
         if rectify:
-            artifacts = rectified(artifacts, fov)
-        out = destination / f"{artifacts.name}{_SUFFIXES.get(format, '')}"
-        typer.echo(_write(artifacts, out, format, depth_stride, beside_rgb, text, every, voxel, least))
+            chosen = rectified(chosen, fov)
+        stem = artifacts.name if shot is None else f"{artifacts.name}-shot{shot}"
+        out = destination / f"{stem}{_SUFFIXES.get(format, '')}"
+        typer.echo(_write(chosen, out, format, depth_stride, beside_rgb, text, every, voxel, least))
         if rectify:
-            write_maps(artifacts, out / MAPS_FILE if out.is_dir() else out.with_name(f"{artifacts.name}_{MAPS_FILE}"))
+            write_maps(chosen, out / MAPS_FILE if out.is_dir() else out.with_name(f"{stem}_{MAPS_FILE}"))
 
 
 # What has no suffix is a folder.

@@ -78,6 +78,7 @@ def export_colmap(
         voxel, min_confidence: Of the cloud, see `fuse_cloud`.
 
     Raises:
+        ExportUnsupported: The sequence has cuts.
         FormatError: No depth or no rgb, or `out` is something else than an earlier export.
     """
     cloud = fuse_cloud(artifacts, voxel=voxel, min_confidence=min_confidence, step=step)

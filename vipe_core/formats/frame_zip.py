@@ -109,6 +109,10 @@ class FrameZipReader(_FrameZip, ABC, Generic[Pixel]):
     def __len__(self) -> int:
         return len(self._members)
 
+    def keep(self, frames: range) -> None:
+        """Read these frames only, numbered from 0 again."""
+        self._members = [self._members[index] for index in frames]
+
     def __iter__(self) -> Iterator[NDArray[Pixel]]:
         for index in range(len(self)):
             yield self.read(index)

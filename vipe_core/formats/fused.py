@@ -7,7 +7,7 @@ from contextlib import closing
 import numpy as np
 
 from vipe_core.cameras import Camera
-from vipe_core.errors import FormatError
+from vipe_core.errors import ExportUnsupported, FormatError
 from vipe_core.formats.frames import read_frames, spread
 from vipe_core.formats.reading import Artifacts
 from vipe_core.fusion import CloudFuser, Mesh, PointCloud, TsdfVolume
@@ -45,6 +45,17 @@ def pixel_angle(camera: Camera) -> float:
     return float(np.linalg.norm(np.cross(a, b)) / (np.linalg.norm(a) * np.linalg.norm(b)))
 
 
+def _need_one_shot(artifacts: Artifacts) -> None:
+    """Raises:
+    ExportUnsupported: The sequence has cuts, so no world that its frames share.
+    """
+    if artifacts.cuts:
+        at = ", ".join(map(str, artifacts.cuts))
+        raise ExportUnsupported(
+            f"{artifacts.name}: the video has cuts (at frame {at}), and its shots share no world; take one by --shot"
+        )
+
+
 def fuse_cloud(
     artifacts: Artifacts,
     *,
@@ -62,8 +73,10 @@ def fuse_cloud(
         step: Use every n-th frame.
 
     Raises:
+        ExportUnsupported: The sequence has cuts.
         FormatError: No depth or no rgb.
     """
+    _need_one_shot(artifacts)
     depth, pixel = median_depth(artifacts), pixel_angle(artifacts.camera)
     size = depth * max(_CLOUD_SHARE, _VOXEL_PX * pixel) if voxel is None else voxel
     fuser = CloudFuser(artifacts.camera, artifacts.depth_kind, size, max_points=max_points)
@@ -94,8 +107,10 @@ def fuse_mesh(
         max_blocks: Bounds memory at about 10 kB each; a field that would have more gets larger voxels.
 
     Raises:
+        ExportUnsupported: The sequence has cuts.
         FormatError: No depth or no rgb.
     """
+    _need_one_shot(artifacts)
     depth, pixel = median_depth(artifacts), pixel_angle(artifacts.camera)
     size = depth * max(_MESH_SHARE, _VOXEL_PX * pixel) if voxel is None else voxel
     volume = TsdfVolume(artifacts.camera, artifacts.depth_kind, size, max_blocks=max_blocks)

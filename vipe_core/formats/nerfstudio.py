@@ -44,7 +44,8 @@ def export_nerfstudio(
         voxel, min_confidence: Of the cloud, see `fuse_cloud`.
 
     Raises:
-        ExportUnsupported: A unified (mei) camera, or a rational distortion, which nerfstudio has no models for.
+        ExportUnsupported: A unified (mei) camera, or a rational distortion, which nerfstudio has no models for; or the
+            sequence has cuts.
         FormatError: No depth or no rgb, or `out` is something else than an earlier export.
     """
     intrinsics = _intrinsics(artifacts.name, artifacts.camera)

@@ -7,7 +7,7 @@ import zipfile
 import zlib
 from collections.abc import Callable, Generator
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -57,6 +57,7 @@ class Artifacts:
         info: Our description of the sequence; empty for directories of the original tool.
         seen_by: How the pictures on disk become those of `camera`, where that is not the one they were taken with: see
             `rectified.py`.
+        part: Which of the frames on disk these are; None for all.
     """
 
     root: Path
@@ -69,10 +70,45 @@ class Artifacts:
     timestamps_s: NDArray[np.float64] | None
     info: dict[str, Any]
     seen_by: PixelMap | None = None
+    part: range | None = None
 
     @property
     def num_frames(self) -> int:
         return len(self.world_from_cam)
+
+    @property
+    def cuts(self) -> tuple[int, ...]:
+        """First frames of the shots but the first. Each shot has a world of its own, and a scale where that is
+        relative: what lies between them is not measured."""
+        stated = (self.info.get("quality") or {}).get("cuts", ())
+        return () if self.part is not None else tuple(int(cut) for cut in stated)
+
+    def shot(self, number: int) -> Artifacts:
+        """One shot by itself, numbered from 1; frames count from 0 again.
+
+        Raises:
+            FormatError: There is no such shot.
+        """
+        bounds = [0, *self.cuts, self.num_frames]
+        if not 1 <= number < len(bounds):
+            raise FormatError(f"{self.name}: there is no shot {number}; there are {len(bounds) - 1}, the first is 1")
+        part = range(bounds[number - 1], bounds[number])
+        rows = slice(part.start, part.stop)
+        return replace(
+            self,
+            world_from_cam=self.world_from_cam[rows],
+            frame_index=self.frame_index[rows],
+            intrinsics=self.intrinsics[rows],
+            timestamps_s=None if self.timestamps_s is None else self.timestamps_s[rows],
+            part=part,
+        )
+
+    def longest_shot(self) -> Artifacts:
+        """The whole sequence where it has no cuts."""
+        if not self.cuts:
+            return self
+        lengths = np.diff([0, *self.cuts, self.num_frames])
+        return self.shot(1 + int(lengths.argmax()))
 
     @property
     def has_depth(self) -> bool:
@@ -101,7 +137,8 @@ class Artifacts:
         """
         if self.rgb_path is None:
             raise FormatError(f"{self.name}: the attribute rgb is needed and is not there")
-        with closing(open_source(self.rgb_path).frames(stop=self.num_frames)) as frames:
+        part = self.part or range(self.num_frames)
+        with closing(open_source(self.rgb_path).frames(start=part.start, stop=part.stop)) as frames:
             for frame in frames:
                 yield frame.rgb if self.seen_by is None else _in_black(self.seen_by, frame.rgb)
 
@@ -145,6 +182,8 @@ class Artifacts:
         return self.seen_by.nearest(picture, UNOBSERVED)
 
     def _checked(self, reader: Reader, resample: Callable[[NDArray[Any]], NDArray[Any]]) -> Reader:
+        if self.part is not None and self.part.stop <= len(reader):
+            reader.keep(self.part)
         if len(reader) != self.num_frames:
             reader.close()
             raise FormatError(f"{self.name}: {len(reader)} {reader.kind}s for {self.num_frames} poses")

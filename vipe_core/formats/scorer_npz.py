@@ -2,7 +2,8 @@
 
 Keys: cam_to_world (N,4,4) float64; intrinsics (N,D) float64 (`Camera.params`: fx, fy, cx, cy [, alpha or distortion],
 half-pixel centres, pixels of width x height); frame_index (N,) int64; camera (a model of `Camera`); width, height;
-depth (N,h,w) float16, where 0 is no value; depth_kind (`z` or `ray`).
+depth (N,h,w) float16, where 0 is no value; depth_kind (`z` or `ray`); cuts (K,) int64, first frames of the
+shots but the first, each of which has a world of its own.
 """
 
 from __future__ import annotations
@@ -43,6 +44,7 @@ def export_npz(artifacts: Artifacts, out: str | Path, *, depth_stride: int = 4) 
         "camera": np.array(artifacts.camera.model),
         "width": np.array(artifacts.camera.width),
         "height": np.array(artifacts.camera.height),
+        "cuts": np.array(artifacts.cuts, dtype=np.int64),
     }
     if artifacts.has_depth:
         arrays["depth"] = _stacked_depth(artifacts, depth_stride)

@@ -67,10 +67,12 @@ def write_gallery(
 ) -> list[Path]:
     """Write `NAME_overview.jpg` and the rest of `PICTURES` and `FILMS` into `folder`; returns them in this order.
 
+    Of a sequence with cuts they show the longest shot.
+
     Raises:
         FormatError: No depth or no rgb.
     """
-    gallery = _Gallery(artifacts, Path(folder), sizes or GallerySizes())
+    gallery = _Gallery(artifacts.longest_shot(), Path(folder), sizes or GallerySizes())
     gallery.draw()
     return [gallery.path(name) for name in (*PICTURES, *FILMS)]
 

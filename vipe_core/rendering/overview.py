@@ -29,7 +29,7 @@ _VIEW = (1000, 700)
 
 
 def write_overview(artifacts: Artifacts, out: str | Path, *, truth: NDArray[np.float64] | None = None) -> Path:
-    """Write a `.jpg` or `.png`.
+    """Write a `.jpg` or `.png`; of a sequence with cuts it shows the longest shot.
 
     Args:
         truth: (N, 4, 4) true poses in the world of the sequence: their path is drawn in white.
@@ -37,6 +37,9 @@ def write_overview(artifacts: Artifacts, out: str | Path, *, truth: NDArray[np.f
     Raises:
         FormatError: No depth or no rgb.
     """
+    artifacts = artifacts.longest_shot()
+    if truth is not None and artifacts.part is not None:
+        truth = truth[artifacts.part.start : artifacts.part.stop]
     cloud, stage = scene(artifacts)
     with closing(read_frames(artifacts, spread(artifacts.num_frames, 2).__contains__)) as frames:
         ends = list(frames)
