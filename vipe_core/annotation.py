@@ -40,6 +40,7 @@ class Quality:
         frame_coverage: (N,) float32 share of the cells of each frame that its pose explains.
         frame_interpolated: (N,) bool, True on frames whose pose nothing measures: it is interpolated.
         cuts: Frames at which another shot starts. Each shot is right by itself; the step over a cut is not measured.
+        zoom_ratio: Longest over shortest focal length within a shot; 1 where no change is seen.
         loop_edges: Links between keyframes far apart in time.
         loop_residual_before_px: Median residual of those links before the last global adjustment, source pixels; NaN
             without any.
@@ -66,6 +67,7 @@ class Quality:
     loop_residual_after_px: float = float("nan")
     loop_moved_ratio: float = 0.0
     scale_sigma_ratio: float = float("nan")
+    zoom_ratio: float = 1.0
 
     def summary(self) -> dict[str, object]:
         """The scalar fields, JSON-ready (no NaN: missing is None)."""
@@ -84,6 +86,7 @@ class Quality:
             "fov_interval_deg": [number(end) for end in self.fov_interval_deg],
             "num_interpolated": int(self.frame_interpolated.sum()),
             "cuts": list(self.cuts),
+            "zoom_ratio": number(self.zoom_ratio),
             "loop_edges": self.loop_edges,
             "loop_residual_before_px": number(self.loop_residual_before_px),
             "loop_residual_after_px": number(self.loop_residual_after_px),

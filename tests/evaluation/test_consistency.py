@@ -12,16 +12,15 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from vipe_core.cameras import Camera
+from vipe_core.cameras import Camera, CameraModel
 from vipe_core.errors import ConfigError
 from vipe_core.evaluation.consistency import (
-    fundamental_matrix,
-    sampson_distances,
     sampson_errors,
+    sampson_px,
     shuttle_errors,
 )
 from vipe_core.evaluation.matching import SiftMatcher, point_matcher
-from vipe_core.evaluation.synthetic import tiny_clip
+from vipe_core.evaluation.synthetic import sample_camera, tiny_clip
 
 CAMERA = Camera("pinhole", (300.0, 310.0, 160.0, 120.0), 320, 240)
 
@@ -77,7 +76,7 @@ def test_points_on_their_epipolar_lines_have_no_error() -> None:
     points = rng.uniform((-1, -1, 3), (1, 1, 9), (50, 3))
     x = CAMERA.project(points)[0]
     y = CAMERA.project(points @ relative[:3, :3].T + relative[:3, 3])[0]
-    distance = sampson_distances(fundamental_matrix(relative, CAMERA), x, y)
+    distance = sampson_px(relative, CAMERA, x, y)
     np.testing.assert_allclose(distance, 0, atol=1e-8)
 
 
@@ -88,13 +87,24 @@ def test_sampson_distance_of_a_sideways_step() -> None:
     square = Camera("pinhole", (300.0, 300.0, 160.0, 120.0), 320, 240)
     x = np.array([[10.0, 20.0], [200.0, 90.0]])
     y = x + np.array([[7.0, 0.5], [-4.0, 2.0]])
-    distance = sampson_distances(fundamental_matrix(relative, square), x, y)
+    distance = sampson_px(relative, square, x, y)
     np.testing.assert_allclose(distance, np.array([0.5, 2.0]) / math.sqrt(2), rtol=1e-9)
 
 
-def test_a_wide_angle_camera_has_no_fundamental_matrix() -> None:
-    with pytest.raises(ValueError, match="mei"):
-        fundamental_matrix(np.eye(4), Camera("mei", (100.0, 100.0, 160.0, 120.0, 0.5), 320, 240))
+@pytest.mark.parametrize("model", ["mei", "opencv", "opencv_fisheye", "equirect"])
+def test_of_a_bent_lens_the_distance_is_from_the_epipolar_curve(model: CameraModel) -> None:
+    camera = sample_camera(model, 320, 240)
+    rng = np.random.default_rng(1)
+    first, second = walk(2, 3)
+    relative = np.linalg.inv(second) @ first
+    points = camera.unproject(rng.uniform((40, 60), (280, 180), (40, 2))) * rng.uniform(1, 5, 40)[:, None]
+    (x, seen_x), (y, seen_y) = (camera.project(p) for p in (points, points @ relative[:3, :3].T + relative[:3, 3]))
+    both = seen_x & seen_y
+    assert both.sum() > 20
+    np.testing.assert_allclose(sampson_px(relative, camera, x[both], y[both]), 0, atol=1e-8)
+    # A match that is off by a little lies between nothing and that far from its curve.
+    away = sampson_px(relative, camera, x[both], y[both] + rng.normal(0, 0.3, (both.sum(), 2)))
+    assert 0.03 < np.median(away) < 0.4
 
 
 def test_sampson_error_tells_true_poses_from_wrong_ones() -> None:

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vipe_core.cameras import Camera
+from vipe_core.cameras.epipolar import RaySlopes, essential_matrix, sampson_distances
 from vipe_core.evaluation.matching import PointMatcher
 from vipe_core.evaluation.metrics import trajectory_errors
 from vipe_core.geometry.arrays import inverse
@@ -91,32 +92,20 @@ def unit_length(world_from_cam: NDArray[np.float64]) -> NDArray[np.float64]:
     return scaled
 
 
-def fundamental_matrix(second_from_first: NDArray[np.float64], camera: Camera) -> NDArray[np.float64]:
-    """F with y^T F x = 0 for integer-index pixels x of the first and y of the second picture.
-
-    Raises:
-        ValueError: The camera is not a pinhole.
-    """
-    if camera.model != "pinhole":
-        raise ValueError(f"a camera {camera.model!r} has no fundamental matrix")
-    fx, fy, cx, cy = camera.index_params()
-    from_pixels = np.array([[1 / fx, 0, -cx / fx], [0, 1 / fy, -cy / fy], [0, 0, 1]])
-    x, y, z = second_from_first[:3, 3]
-    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    matrix: NDArray[np.float64] = from_pixels.T @ cross @ second_from_first[:3, :3] @ from_pixels
-    return matrix
-
-
-def sampson_distances(
-    fundamental: NDArray[np.float64], first_px: NDArray[np.float64], second_px: NDArray[np.float64]
+def sampson_px(
+    second_from_first: NDArray[np.float64],
+    camera: Camera,
+    first_px: NDArray[np.float64],
+    second_px: NDArray[np.float64],
 ) -> NDArray[np.float64]:
-    """(K,) Sampson distances in pixels of matches (K, 2) and (K, 2); the paper's formula."""
-    x = np.concatenate([first_px, np.ones((len(first_px), 1))], axis=1)
-    y = np.concatenate([second_px, np.ones((len(second_px), 1))], axis=1)
-    line, line_back = x @ fundamental.T, y @ fundamental
-    slope = np.square(line[:, :2]).sum(axis=1) + np.square(line_back[:, :2]).sum(axis=1)
-    distance: NDArray[np.float64] = np.abs((y * line).sum(axis=1)) / np.sqrt(np.maximum(slope, 1e-300))
-    return distance
+    """(K,) Sampson distances in pixels of matches (K, 2) and (K, 2), integer-index coordinates; of a pinhole the
+    paper's formula, of another camera the same with epipolar curves in place of lines.
+
+    Args:
+        second_from_first: (4, 4) with a translation.
+    """
+    rays = (RaySlopes.of(camera, px) for px in (first_px, second_px))
+    return np.abs(sampson_distances(essential_matrix(second_from_first), *rays))
 
 
 def sampson_errors(
@@ -130,14 +119,13 @@ def sampson_errors(
 
     Args:
         world_from_cam: (N, 4, 4) of the first N frames of the source.
-        camera: A pinhole at the source's resolution.
+        camera: At the source's resolution.
         report: Told how many frames are done.
 
     Returns:
         None when no pair can be measured: nothing matches, or the camera never moves, when there is no epipolar line.
 
     Raises:
-        ValueError: The camera is not a pinhole.
         InputError, DecodeError: From the source.
     """
     means: list[float] = []
@@ -152,7 +140,7 @@ def sampson_errors(
                 relative = cam_from_world[frame.index] @ world_from_cam[frame.index - 1]
                 first_px, second_px = matcher.match(previous, current)
                 if len(first_px) and np.linalg.norm(relative[:3, 3]) > 0:
-                    distance = sampson_distances(fundamental_matrix(relative, camera), first_px, second_px)
+                    distance = sampson_px(relative, camera, first_px, second_px)
                     means.append(float(distance.mean()))
                     medians.append(float(np.median(distance)))
                     matches += len(distance)

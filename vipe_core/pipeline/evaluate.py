@@ -248,8 +248,6 @@ def _run(task: Task) -> tuple[SequenceResult, Paths | None]:
 
 
 def _sampson(source: FrameSource, annotation: Annotation, measure: Measure) -> SampsonErrors | None:
-    if annotation.camera.model != "pinhole":
-        return None
     matcher = point_matcher(measure.matcher, measure.device)
     return sampson_errors(source, annotation.world_from_cam, annotation.camera, matcher)
 

@@ -9,6 +9,7 @@ Reason codes are stable: they are stored with every video.
     low_parallax        little parallax: positions and depth are weak
     low_texture         most of the picture could not be measured
     focal_unobservable  the field of view is not known to 10 %, or nothing but single pictures tells it
+    zoom                the focal length changes within a shot, but the result has one: depth and path are bent
     high_residual       the measurements that fit, fit badly
     low_inliers         much of the picture contradicts the camera motion (moving objects, or a wrong solution)
     weak_link           two parts of a shot hang together by almost nothing: a blur, a jump
@@ -81,6 +82,8 @@ def assess(result: SlamResult, settings: SlamSettings, source_width: int) -> Qua
         if found.weakest_link < _WEAK_LINK:
             reasons.append("weak_link")
             fatal = True
+    if result.zoom.changes:
+        reasons.append("zoom")
     if result.cuts:
         reasons.append("shot_cut")
     interpolated = float(result.trajectory.interpolated.mean())
@@ -110,6 +113,7 @@ def assess(result: SlamResult, settings: SlamSettings, source_width: int) -> Qua
         frame_coverage=result.trajectory.coverage,
         frame_interpolated=result.trajectory.interpolated,
         cuts=result.cuts,
+        zoom_ratio=result.zoom.ratio if result.zoom.changes else 1.0,
         loop_edges=result.loops.edges,
         loop_residual_before_px=result.loops.residual_before_px * to_source,
         loop_residual_after_px=result.loops.residual_after_px * to_source,

@@ -33,6 +33,7 @@ from vipe_core.slam.settings import SlamSettings
 from vipe_core.slam.timing import StageClock
 from vipe_core.slam.tracking import Tracker
 from vipe_core.slam.working import WorkingSize
+from vipe_core.slam.zoom import Zoom, find_zoom
 
 logger = logging.getLogger(__name__)
 
@@ -59,6 +60,7 @@ class ShotMap:
         fitter: Fits rotations, where there is nothing else to fit.
         usable: (K, P) bool, cells of each keyframe that are static and whose depth other views confirm.
         labels: (K, P) int8, what each cell of a keyframe does; see `segmentation.py`.
+        zoom: Whether the focal length changes in it.
     """
 
     shot: Shot
@@ -72,6 +74,7 @@ class ShotMap:
     fitter: RotationFitter | None
     usable: NDArray[np.bool_]
     labels: NDArray[np.int8]
+    zoom: Zoom
 
 
 @dataclass(frozen=True, slots=True)
@@ -148,8 +151,10 @@ class ShotMapper:
         if motion == "general":
             usable = np.stack([masks.reliable(k) for k in range(len(keyframes))])
             labels = np.stack([masks.labels(k) for k in range(len(keyframes))])
+        with self._clock("zoom"):
+            zoom = find_zoom(keyframes, graph, scale_px)
         return ShotMap(
-            shot, keyframes, graph, motion, focal_sigma_ratio, found, loops, adjuster, fitter, usable, labels
+            shot, keyframes, graph, motion, focal_sigma_ratio, found, loops, adjuster, fitter, usable, labels, zoom
         )
 
     def _measured(

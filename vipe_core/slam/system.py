@@ -25,6 +25,7 @@ from vipe_core.slam.selection import Report, Selection, Shot, select_keyframes
 from vipe_core.slam.settings import SlamSettings
 from vipe_core.slam.timing import StageClock
 from vipe_core.slam.working import WorkingSize, working_size
+from vipe_core.slam.zoom import NO_ZOOM, Zoom
 from vipe_core.video.source import FrameSource
 
 # How closely the later shots hold the focal length that the main one found: they share a camera.
@@ -54,6 +55,7 @@ class SlamResult:
         map: Diagnostics, with the confidence of every inverse depth.
         loops: What the loop edges of the main shot did.
         timings_s: Wall seconds per stage.
+        zoom: Of the shot whose focal length changes most.
     """
 
     world_from_cam: NDArray[np.float64]
@@ -70,6 +72,7 @@ class SlamResult:
     map: MapReport
     loops: LoopReport
     timings_s: dict[str, float]
+    zoom: Zoom = NO_ZOOM
 
     @property
     def grid(self) -> Grid:
@@ -106,9 +109,7 @@ class Slam:
         offset_px = None if refiner is None else refiner.offset_px
         info = source.info
         aspect = info.pixel_aspect if known is None else known.camera.params[1] / known.camera.params[0]
-        size = working_size(
-            info.width, info.height, settings.working_area_px, offset_px=offset_px, pixel_aspect=aspect
-        )
+        size = working_size(info.width, info.height, settings.working_area_px, offset_px=offset_px, pixel_aspect=aspect)
         frames = EncodedFrames(source, size, self._priors.matcher, settings.frame_cache_bytes)
         with clock("scan"):
             selection = select_keyframes(frames, size, settings, report)
@@ -155,6 +156,7 @@ class Slam:
             map=combine([one.found for one in maps]),
             loops=maps[main].loops,
             timings_s=clock.seconds,
+            zoom=max((one.zoom for one in maps), key=lambda zoom: (zoom.changes, zoom.ratio)),
         )
 
     def _map(

@@ -14,13 +14,11 @@ from dataclasses import dataclass
 
 import numpy as np
 import poselib
-import torch
-from numpy.typing import NDArray
 
 from vipe_core.ba.problem import Grid
 from vipe_core.cameras import Camera
+from vipe_core.cameras.epipolar import RaySlopes, essential_matrix, sampson_distances
 from vipe_core.cameras.ideal import ideal_camera, ideal_px
-from vipe_core.cameras.projection import unproject
 from vipe_core.priors.classical.pairs import FramePair, PairPicker
 from vipe_core.priors.protocols import IntrinsicsEstimate, IntrinsicsInit, WorkingFrame
 
@@ -134,28 +132,8 @@ def _cost(camera: Camera, pair: FramePair) -> float:
     rotation, direction = np.asarray(pose.R, np.float64), np.asarray(pose.t, np.float64)
     if not np.isfinite(rotation).all() or not np.linalg.norm(direction) > 0:
         return 1.0
-    x, y, z = direction / np.linalg.norm(direction)
-    essential = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ rotation
-    squared = _sampson(camera, essential, pair.source_px, pair.target_px)
-    return float(np.minimum(squared / _CUT_PX**2, 1).mean())
-
-
-def _sampson(
-    camera: Camera, essential: NDArray[np.float64], source_px: NDArray[np.float64], target_px: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """(n,) squared distance of correspondences from the epipolar constraint, to first order, px^2."""
-    params = torch.from_numpy(camera.index_params())
-    rays, slopes = [], []
-    for px in (source_px, target_px):
-        at = torch.from_numpy(px)
-        rays.append(unproject("mei", params, at).numpy())
-        # d ray / d u = -d ray / d cx: by differences, which is exact enough for a weight.
-        steps = [(unproject("mei", params, at + step) - unproject("mei", params, at - step)) / 2 for step in _UNITS]
-        slopes.append(torch.stack(steps, dim=-1).numpy())
-    error = np.einsum("ni,ij,nj->n", rays[1], essential, rays[0])
-    by_source = np.einsum("ni,ij,njk->nk", rays[1], essential, slopes[0])
-    by_target = np.einsum("nik,ij,nj->nk", slopes[1], essential, rays[0])
-    return np.asarray(error**2 / np.maximum((by_source**2).sum(1) + (by_target**2).sum(1), 1e-30))
-
-
-_UNITS = torch.eye(2, dtype=torch.float64)
+    relative = np.eye(4)
+    relative[:3, :3], relative[:3, 3] = rotation, direction / np.linalg.norm(direction)
+    rays = (RaySlopes.of(camera, px) for px in (pair.source_px, pair.target_px))
+    away_px = sampson_distances(essential_matrix(relative), *rays)
+    return float(np.minimum(np.square(away_px / _CUT_PX), 1).mean())
