@@ -36,9 +36,27 @@ class TestCreate:
         assert "idempotent-replayed" not in answer.headers
         assert job["state"] == "queued"
         expected = {**wanted, "output": "s3://bucket/out", "attributes": ["pose", "intrinsics", "depth"]}
+        expected["calibration"] = None
         assert job["spec"] == expected
         assert job["progress"]["frames_expected"] is None
         assert http.get(answer.headers["location"]).json() == job
+
+    def test_a_calibration_goes_along_in_one_form(self, http: httpx.Client) -> None:
+        lens = {
+            "version": 1,
+            "model": "pinhole",
+            "width": 640,
+            "height": 480,
+            "fx": 500,
+            "fy": 505,
+            "cx": 340,
+            "cy": 240,
+        }
+        spec = http.post("/v1/jobs", json=body(calibration={**lens, "pixel_centre": "integer"})).json()["spec"]
+        assert spec["calibration"] == {**lens, "cx": 340.5, "cy": 240.5, "use": "fixed"}
+        assert JobSpec.from_json(spec).config_hash != JobSpec.from_json({**spec, "calibration": None}).config_hash
+        for wrong in ({"calibration": {**lens, "fx": -1}}, {"calibration": lens, "camera": "mei"}):
+            assert http.post("/v1/jobs", json=body(**wrong)).status_code == 422
 
     def test_attributes_of_a_request_and_of_the_domain_agree(self, http: httpx.Client) -> None:
         job = http.post("/v1/jobs", json=body()).json()

@@ -134,7 +134,7 @@ def test_rectified_pictures_and_depth_are_those_of_the_pinhole(rooms: dict[str, 
     error = np.abs(frame.depth[use] / exact[use] - 1)
     assert np.quantile(error, 0.9) < 0.01
     same = np.abs(frame.rgb.astype(int) - colour).max(axis=-1) < 60
-    assert same[use].mean() > 0.9
+    assert same[use].mean() > 0.8
 
 
 def test_what_a_pinhole_sees_beyond_the_picture_is_black_and_without_depth(rooms: dict[str, Artifacts]) -> None:
