@@ -15,6 +15,7 @@ from vipe_core.slam.infill import Trajectory
 from vipe_core.slam.settings import SlamSettings
 from vipe_core.slam.system import SlamResult
 from vipe_core.slam.working import WorkingSize
+from vipe_core.slam.zoom import Zoom
 
 _FRAMES, _KEYFRAMES = 40, 10
 _WORKING = WorkingSize(320, 240)
@@ -126,3 +127,16 @@ def test_what_is_known_of_each_frame_is_handed_on_in_source_pixels() -> None:
     assert frames["frame_residual_px"] == [0.0] + [0.2] * (_FRAMES - 1)
     summary = quality.summary()
     assert (summary["num_interpolated"], summary["loop_edges"], summary["loop_residual_before_px"]) == (1, 3, 4.0)
+
+
+def test_a_zoom_is_reported_with_its_ratio() -> None:
+    quality = verdict(good(zoom=Zoom(1.4, 0.02)))
+    assert (quality.reliable, quality.reasons, quality.zoom_ratio) == ("doubtful", ("zoom",), 1.4)
+    assert quality.summary()["zoom_ratio"] == 1.4
+    unsure = verdict(good(zoom=Zoom(1.4, 0.2)))
+    assert (unsure.reasons, unsure.zoom_ratio) == ((), 1.0)
+
+
+def test_the_focal_length_of_a_given_camera_is_known_though_it_stands_still() -> None:
+    assert "focal_unobservable" in verdict(good(motion="static")).reasons
+    assert "focal_unobservable" not in verdict(good(motion="static", focal_sigma_ratio=0.0)).reasons

@@ -33,7 +33,7 @@ from vipe_core.slam.settings import SlamSettings
 from vipe_core.slam.timing import StageClock
 from vipe_core.slam.tracking import Tracker
 from vipe_core.slam.working import WorkingSize
-from vipe_core.slam.zoom import Zoom, find_zoom
+from vipe_core.slam.zoom import NO_ZOOM, Zoom, find_zoom
 
 logger = logging.getLogger(__name__)
 
@@ -60,7 +60,7 @@ class ShotMap:
         fitter: Fits rotations, where there is nothing else to fit.
         usable: (K, P) bool, cells of each keyframe that are static and whose depth other views confirm.
         labels: (K, P) int8, what each cell of a keyframe does; see `segmentation.py`.
-        zoom: Whether the focal length changes in it.
+        zoom: Whether the focal length changes in it; not looked for in a rig, whose cameras are calibrated.
     """
 
     shot: Shot
@@ -74,7 +74,7 @@ class ShotMap:
     fitter: RotationFitter | None
     usable: NDArray[np.bool_]
     labels: NDArray[np.int8]
-    zoom: Zoom
+    zoom: Zoom = NO_ZOOM
 
 
 @dataclass(frozen=True, slots=True)

@@ -36,13 +36,14 @@ Array = NDArray[Any]
 
 _STEP = 2
 _MIN_POINTS = 60
-_MAX_POINTS = 250
+_MAX_POINTS = 400
 _MIN_WEIGHT = 0.05
 # Pairs are told to keep their focal length with this sigma of log s: a second of fast zoom between two keyframes.
 _PRIOR_SIGMA = 0.3
 # Robust kernel, pixels of a working image that is 640 wide: from wide to narrow.
-_SCALES_PX = (4.0, 1.0)
-_ITERATIONS = 4
+_SCALES_PX = (8.0, 2.0, 1.0)
+_ITERATIONS = 5
+_TRIES = 4
 _DIFFERENCE = 1e-5
 # Errors of flow are correlated: formal sigmas are too small by about this factor.
 _INFLATION = 3.0
@@ -138,7 +139,7 @@ def _pair(keyframes: KeyframeMap, graph: Graph, i: int, j: int, scale_px: float)
 
 
 def _cost(residual: Array, scale: float) -> float:
-    square = np.square(residual / scale)
+    square = np.square(residual / scale).sum(axis=1)
     return float((square / (1 + square)).mean())
 
 
@@ -171,7 +172,7 @@ class _Epipolar:
 
 
 def _fit(error: Callable[[Array], Array], size: int, scales: list[float]) -> tuple[Array, Array, Array]:
-    """Robust Gauss-Newton from 0; value 3 is log s.
+    """Robust Levenberg-Marquardt from 0; value 3 is log s.
 
     Returns:
         The values, their information matrix for residuals of variance 1, and the residuals (n, d).
@@ -180,20 +181,28 @@ def _fit(error: Callable[[Array], Array], size: int, scales: list[float]) -> tup
     information = np.eye(size)
     residual = error(values)
     for scale in scales:
+        damping = 1e-6
+        cost = _cost(residual, scale)
         for _ in range(_ITERATIONS):
             columns = [(error(values + _DIFFERENCE * unit) - residual) / _DIFFERENCE for unit in np.eye(size)]
             kernel = 1 / np.square(1 + np.square(residual / scale).sum(axis=1))
             jacobian = np.stack(columns, axis=-1)
             information = np.einsum("n,nda,ndb->ab", kernel, jacobian, jacobian)
             gradient = np.einsum("n,nda,nd->a", kernel, jacobian, residual)
-            damped = information + np.diag(1e-6 * np.diag(information) + 1e-9)
             # In units of the kernel, so that the prior is weak but there where nothing else tells s.
-            damped[3, 3] += (scale / _PRIOR_SIGMA) ** 2
             gradient[3] += (scale / _PRIOR_SIGMA) ** 2 * values[3]
-            step = np.clip(np.linalg.solve(damped, gradient), -0.2, 0.2)
-            values = values - step
-            residual = error(values)
-            if np.abs(step).max() < 1e-6:
+            for _ in range(_TRIES):
+                damped = information + np.diag(damping * np.diag(information) + 1e-9)
+                damped[3, 3] += (scale / _PRIOR_SIGMA) ** 2
+                step = np.clip(np.linalg.solve(damped, gradient), -0.2, 0.2)
+                tried = error(values - step)
+                if _cost(tried, scale) <= cost:
+                    break
+                damping = max(10 * damping, 1e-3)
+            else:
+                break
+            values, residual, cost, damping = values - step, tried, _cost(tried, scale), damping / 10
+            if np.abs(step).max() < 1e-5:
                 break
     return values, information, residual
 
