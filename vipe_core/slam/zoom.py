@@ -121,14 +121,14 @@ def _pair(keyframes: KeyframeMap, graph: Graph, i: int, j: int, scale_px: float)
     start = relative_pose(keyframes.pose(j), keyframes.pose(i))
     scales = [max(scale * scale_px, 0.5) for scale in _SCALES_PX]
 
-    rays = camera.unproject(source_px)
-
     def turned(values: Array) -> Array:
         rotation = cv2.Rodrigues(values[:3])[0] @ start[:3, :3]
-        px, imaged = camera.zoomed(math.exp(values[3])).project(rays @ rotation.T)
+        # The focal length itself is free as well: the map's is that of no frame in particular.
+        rays = camera.zoomed(math.exp(values[4])).unproject(source_px)
+        px, imaged = camera.zoomed(math.exp(values[3] + values[4])).project(rays @ rotation.T)
         return np.where(imaged[:, None], px - target_px, scales[0])
 
-    values, information, residual = _fit(turned, 4, scales)
+    values, information, residual = _fit(turned, 5, scales)
     if np.median(np.linalg.norm(residual, axis=1)) < max(_TURNED_PX * scale_px, 0.25):
         return _estimate(values[3], information, residual)
     _, _, held = _fit(_Epipolar(camera, source_px, target_px, start, free=False), 6, scales)
