@@ -16,7 +16,7 @@ from vipe_core.formats import write_artifacts
 from vipe_core.pipeline.annotator import Annotator
 from vipe_core.pipeline.presets import PresetOptions, resolve
 from vipe_core.pipeline.providers import register_masks
-from vipe_core.priors.instances import InstanceSettings
+from vipe_core.priors.instance_settings import InstanceSettings
 from vipe_core.priors.protocols import Instances
 from vipe_core.video.source import Frame
 

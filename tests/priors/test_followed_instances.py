@@ -12,7 +12,8 @@ import torch
 from torch import Tensor
 
 from vipe_core.errors import ConfigError
-from vipe_core.priors.instances import Detection, FollowedInstances, InstanceSettings, composed
+from vipe_core.priors.instance_settings import InstanceSettings
+from vipe_core.priors.instances import Detection, FollowedInstances, composed
 from vipe_core.priors.protocols import Instances
 from vipe_core.video.source import Frame
 

@@ -15,7 +15,8 @@ from vipe_core.errors import ConfigError, WeightsInvalid, WeightsMissing
 from vipe_core.priors.hf.grounding_dino import GroundingDino
 from vipe_core.priors.hf.metric_depth import DepthAnything, DepthPro
 from vipe_core.priors.hf.sam2_video import Sam2Propagation, Sam2Video
-from vipe_core.priors.instances import FollowedInstances, InstanceSettings
+from vipe_core.priors.instance_settings import InstanceSettings
+from vipe_core.priors.instances import FollowedInstances
 from vipe_core.video.source import Frame
 
 pytest.importorskip("transformers", reason="the extra hf is not installed")

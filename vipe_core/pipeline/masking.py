@@ -8,7 +8,7 @@ from contextlib import closing
 import torch
 
 from vipe_core.annotation import MASK_PHRASES
-from vipe_core.priors.instances import STATIC_PHRASES
+from vipe_core.priors.instance_settings import STATIC_PHRASES
 from vipe_core.priors.protocols import InstanceMasks
 from vipe_core.video.instances import InstanceMaps
 from vipe_core.video.source import FrameSource

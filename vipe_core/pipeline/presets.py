@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from vipe_core.depth.alignment import AlignmentSettings
 from vipe_core.depth.types import DepthSettings
 from vipe_core.errors import ConfigError
-from vipe_core.priors.instances import InstanceSettings
+from vipe_core.priors.instance_settings import InstanceSettings
 from vipe_core.slam.settings import EnergyTerms, SlamSettings
 
 CAMERAS = ("pinhole", "mei", "auto", "equirect")

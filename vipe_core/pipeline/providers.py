@@ -16,7 +16,8 @@ from vipe_core.errors import ConfigError, LibraryMissing
 from vipe_core.pipeline.presets import FOUND_BY_PHRASES, GEOCALIB, NONE, VIDEO_DEPTH
 from vipe_core.priors.classical import classical_priors
 from vipe_core.priors.droid import DroidMatcher, load_network
-from vipe_core.priors.instances import FollowedInstances, InstanceSettings
+from vipe_core.priors.instance_settings import InstanceSettings
+from vipe_core.priors.instances import FollowedInstances
 from vipe_core.priors.protocols import DepthFamily, InstanceMasks, MetricDepth, PriorFamily
 from vipe_core.priors.rectified import Rectified
 from vipe_core.priors.weights import folder_of, path_of
