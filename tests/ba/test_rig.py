@@ -60,7 +60,7 @@ def rig_problems(draw: st.DrawFn) -> tuple[Problem, State]:
         log_focal=draw(st.sampled_from([None, 4.0])),
         log_focal_sigma=0.1,
         cam_from_rig=se3.exp(torch.full((1, 6), 0.01, dtype=torch.float64)) @ truth.cam_from_rig,
-        extrinsic_sigma=(0.1, 0.05),
+        extrinsic_sigma=torch.tensor([[0.1, 0.05]], dtype=torch.float64).expand(len(truth.cam_from_rig), 2),
     )
     problem = replace(with_noise(problem, 0.05), free=free, priors=prior)
     if draw(st.booleans()):
@@ -96,6 +96,28 @@ def test_frames_of_one_pose_stay_rigid_and_exact_data_is_solved() -> None:
     torch.testing.assert_close(one_each, one_each[:, :1].expand_as(one_each), rtol=0, atol=1e-12)
     assert start.cam_from_rig is not None
     assert torch.equal(result.state.cam_from_rig[0], start.cam_from_rig[0])
+
+
+@pytest.mark.parametrize("single_camera", [True, False])
+def test_the_covariance_of_extrinsics_is_how_far_a_prior_pulls_them(single_camera: bool) -> None:
+    """A prior with information P that moves by x takes the extrinsics along by covariance P x; by both solvers."""
+    problem, truth = rig_scene(num_views=3, own_intrinsics=not single_camera)
+    assert truth.cam_from_rig is not None
+    shift = torch.zeros(3, 6, dtype=torch.float64)
+    shift[1] = 1e-6 * torch.tensor([1.0, -2.0, 0.5, 2.0, 1.0, -1.0])
+    sigma = torch.tensor([[1.0, 1.0], [0.02, 0.01], [0.03, 0.02]], dtype=torch.float64)
+    priors = Priors(cam_from_rig=se3.exp(shift) @ truth.cam_from_rig, extrinsic_sigma=sigma)
+    free = replace(problem.free, extrinsics=True, focal=not single_camera)
+    problem = replace(problem, priors=priors, free=free)
+    step = newton_step(problem, truth, damping=1e-9).extrinsic
+    result = solve(problem, truth, Options(max_iterations=1, robust="none"))
+    assert step is not None
+    assert result.extrinsic_covariances is not None
+    information = sigma[1].repeat_interleave(3).square().reciprocal()
+    expected = result.extrinsic_covariances[1] @ (information * shift[1])
+    torch.testing.assert_close(step[1], expected, rtol=1e-4, atol=1e-10)
+    assert torch.equal(result.extrinsic_covariances[0], torch.zeros(6, 6, dtype=torch.float64))
+    assert (result.extrinsic_covariances[2].diagonal() < sigma[2].repeat_interleave(3).square()).all()
 
 
 def test_edges_within_an_instant_find_depth_but_no_pose() -> None:

@@ -434,6 +434,22 @@ class HostSolver:
             covariance[free, column] = (scale[-1] * unit[-1])[free]
         return torch.from_numpy(covariance)[None]
 
+    def extrinsic_covariance(self, system: HostSystem, damping: float) -> Tensor:
+        """See `Solver.extrinsic_covariance`."""
+        scale, factor, factorised = self._factorise(system, damping)
+        covariance = np.zeros((len(self._view_place), 6, 6))
+        for view in np.flatnonzero(self._view_place >= 0):
+            place = self._view_place[view]
+            if not factorised or not (scale[place] > 0).all():
+                covariance[view] = np.nan
+                continue
+            for column in range(6):
+                unit = np.zeros_like(scale)
+                unit[place, column] = scale[place, column]
+                block_cholesky.substitute(self._structure.first, self._structure.rows, factor, unit)
+                covariance[view, :, column] = scale[place] * unit[place]
+        return torch.from_numpy(covariance)
+
 
 def _flat(measurements: Tensor, dtype: torch.dtype) -> Array:
     """(E, P, 2) -> (E, 2 P) without a copy where it has that layout and type."""

@@ -82,8 +82,9 @@ def solve(problem: Problem, state: State, options: Options | None = None) -> Res
     status = descent.run()
 
     covariances = _intrinsics_covariances(solver, descent) if any(solver.intrinsics_free) else (NO_COVARIANCE,)
+    extrinsic = _extrinsic_covariances(solver, descent) if problem.rig and problem.free.extrinsics else None
     measured, weight = _read(descent.cost.measurements, descent.cost.weight)
-    return Result(descent.state, status, descent.iterations, initial_cost, measured, weight, covariances)
+    return Result(descent.state, status, descent.iterations, initial_cost, measured, weight, covariances, extrinsic)
 
 
 def _intrinsics_covariances(solver: Solver[Any], descent: _Descent) -> tuple[Covariance, ...]:
@@ -100,6 +101,15 @@ def _intrinsics_covariances(solver: Solver[Any], descent: _Descent) -> tuple[Cov
                 break
         chosen.append(best)
     return tuple(chosen)
+
+
+def _extrinsic_covariances(solver: Solver[Any], descent: _Descent) -> Tensor:
+    """Of each camera of a rig, likewise."""
+    found = torch.stack([solver.extrinsic_covariance(descent.system(), damping) for damping in _SIGMA_DAMPINGS]).cpu()
+    sound = (found.diagonal(dim1=-2, dim2=-1) >= 0).all(-1)
+    first = sound.int().argmax(0)
+    chosen = found[first, torch.arange(found.shape[1])]
+    return torch.where(sound.any(0)[:, None, None], chosen, torch.nan)
 
 
 class _Descent:

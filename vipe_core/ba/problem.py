@@ -147,7 +147,7 @@ class Priors:
         log_focal: Prior of log(fx), or None. Where views have intrinsics of their own, of each of them, or one each.
         log_focal_sigma: Its standard deviation.
         cam_from_rig: (V, 4, 4) prior of the extrinsics, or None.
-        extrinsic_sigma: Its standard deviations: of the place in world units, of the rotation in radians.
+        extrinsic_sigma: (V, 2) its standard deviations: of the place in world units, of the rotation in radians.
     """
 
     inverse_depth: Tensor | None = None
@@ -155,7 +155,11 @@ class Priors:
     log_focal: float | tuple[float, ...] | None = None
     log_focal_sigma: float = 1.0
     cam_from_rig: Tensor | None = None
-    extrinsic_sigma: tuple[float, float] = (1.0, 1.0)
+    extrinsic_sigma: Tensor | None = None
+
+    def __post_init__(self) -> None:
+        if (self.cam_from_rig is None) != (self.extrinsic_sigma is None):
+            raise ValueError("a prior of the extrinsics needs its standard deviations")
 
 
 @dataclass(frozen=True, slots=True)
@@ -228,6 +232,8 @@ class Result:
         intrinsics_covariances: ((var, cov), (cov, var)) of log(f) and alpha from the reduced system at the end, with
             everything else marginalised; 0 for what was fixed, NaN where the system says nothing. One, or one per view
             where each has its own intrinsics.
+        extrinsic_covariances: (V, 6, 6) float64 on the host, of the left twists (place in world units, rotation in
+            radians) of `State.cam_from_rig`, likewise; None where extrinsics were fixed.
     """
 
     state: State
@@ -237,6 +243,7 @@ class Result:
     cost: float
     weight_sum: float
     intrinsics_covariances: tuple[Covariance, ...] = (NO_COVARIANCE,)
+    extrinsic_covariances: Tensor | None = None
 
     @property
     def intrinsics_covariance(self) -> Covariance:

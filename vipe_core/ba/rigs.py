@@ -105,22 +105,23 @@ def extrinsic_residual(cam_from_rig: Tensor, priors: Priors) -> Tensor:
     """(V, 6) how far extrinsics are from their prior, in standard deviations: place, and sine of the angle about the
     axes."""
     assert priors.cam_from_rig is not None
+    assert priors.extrinsic_sigma is not None
     off = se3.relative(cam_from_rig, priors.cam_from_rig.to(cam_from_rig))
     rotation = off[:, :3, :3]
     skewed = rotation - rotation.mT
     sine = torch.stack((skewed[:, 2, 1], skewed[:, 0, 2], skewed[:, 1, 0]), dim=-1) / 2
-    place_sigma, rotation_sigma = priors.extrinsic_sigma
+    place_sigma, rotation_sigma = priors.extrinsic_sigma.to(off)[..., None].unbind(1)
     return torch.cat((off[:, :3, 3] / place_sigma, sine / rotation_sigma), dim=-1)
 
 
 def extrinsic_prior(priors: Priors, state: State) -> tuple[Tensor, Tensor, Tensor] | None:
     """Residual (V, 6), J^T J (V, 6, 6) and -J^T r (V, 6) of the prior by left twists of cam_from_rig; None without."""
-    if priors.cam_from_rig is None or state.cam_from_rig is None:
+    if priors.cam_from_rig is None or priors.extrinsic_sigma is None or state.cam_from_rig is None:
         return None
     residual = extrinsic_residual(state.cam_from_rig, priors)
     off = se3.relative(state.cam_from_rig, priors.cam_from_rig.to(state.cam_from_rig))
     rotation, place = off[:, :3, :3], off[:, :3, 3]
-    place_sigma, rotation_sigma = priors.extrinsic_sigma
+    place_sigma, rotation_sigma = priors.extrinsic_sigma.to(off)[..., None, None].unbind(1)
     jacobian = residual.new_zeros(len(off), 6, 6)
     identity = torch.eye(3, dtype=residual.dtype, device=residual.device)
     jacobian[:, :3, :3] = identity / place_sigma

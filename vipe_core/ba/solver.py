@@ -103,3 +103,6 @@ class Solver(Protocol[System]):
     def intrinsics_covariance(self, system: System, damping: float) -> Tensor:
         """(C, 2, 2) covariance of log f and alpha of each camera with everything else marginalised: 0 for what is held,
         NaN where the damped system is singular."""
+
+    def extrinsic_covariance(self, system: System, damping: float) -> Tensor:
+        """(V, 6, 6) covariance of the left twists of each camera of a rig, likewise."""

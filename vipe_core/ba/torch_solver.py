@@ -482,17 +482,31 @@ class TorchSolver:
         """See `Solver.intrinsics_covariance`."""
         scale, factor, _, factorised = self._factorise(system, damping)
         columns = self.plan.intrinsic_columns
-        cameras, each = columns.shape
-        units = torch.zeros(len(scale), columns.numel(), dtype=scale.dtype, device=scale.device)
-        flat = columns.flatten()
-        units[flat, torch.arange(len(flat), device=flat.device)] = scale[flat]
-        solved = scale[flat][:, None] * torch.cholesky_solve(units, factor)[flat]
-        found = solved.reshape(cameras, each, cameras, each).diagonal(dim1=0, dim2=2).permute(2, 0, 1)
-        sound = factorised & (scale[columns] > 0).all(-1)[:, None, None]
-        covariance = torch.zeros(cameras, 2, 2, dtype=torch.float64, device=scale.device)
+        covariance = torch.zeros(len(columns), 2, 2, dtype=torch.float64, device=scale.device)
         at = torch.tensor(self.plan.free_intrinsics, device=scale.device)
-        covariance[:, at[:, None], at] = torch.where(sound, found, torch.nan)
+        covariance[:, at[:, None], at] = _marginal(columns, scale, factor, factorised)
         return covariance
+
+    def extrinsic_covariance(self, system: Linearisation, damping: float) -> Tensor:
+        """See `Solver.extrinsic_covariance`."""
+        scale, factor, _, factorised = self._factorise(system, damping)
+        columns = self.plan.view_columns
+        covariance = torch.zeros(len(columns), 6, 6, dtype=torch.float64, device=scale.device)
+        # What is held has the number of a column that is none.
+        moves = (columns < len(scale)).all(-1)
+        covariance[moves] = _marginal(columns[moves], scale, factor, factorised)
+        return covariance
+
+
+def _marginal(columns: Tensor, scale: Tensor, factor: Tensor, factorised: Tensor) -> Tensor:
+    """(G, n, n) blocks of the inverse for groups (G, n) of columns; NaN where the system says nothing."""
+    groups, each = columns.shape
+    flat = columns.flatten()
+    units = torch.zeros(len(scale), len(flat), dtype=scale.dtype, device=scale.device)
+    units[flat, torch.arange(len(flat), device=flat.device)] = scale[flat]
+    solved = scale[flat][:, None] * torch.cholesky_solve(units, factor)[flat]
+    found = solved.reshape(groups, each, groups, each).diagonal(dim1=0, dim2=2).permute(2, 0, 1)
+    return torch.where(factorised & (scale[columns] > 0).all(-1)[:, None, None], found, torch.nan)
 
 
 def _border(per_edge: Tensor, tail: int) -> Tensor:

@@ -7,6 +7,7 @@ from wide to narrow.
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -17,6 +18,7 @@ from numpy.typing import NDArray
 
 from vipe_core.ba import robust_scale_px, solve
 from vipe_core.ba.problem import Free, Grid, Options, Priors, Problem, Result, Rig, RobustKernel, State, Status
+from vipe_core.geometry.arrays import inverse
 from vipe_core.slam.graph import Graph
 from vipe_core.slam.keyframes import KeyframeMap
 from vipe_core.slam.settings import SlamSettings
@@ -96,12 +98,17 @@ class FocalPrior:
 
 @dataclass(frozen=True, slots=True)
 class ExtrinsicPrior:
-    """What is known of a rig before: (V, 4, 4) cam_from_rig, and standard deviations of a camera's place, in the same
-    units, and of its rotation, radians."""
+    """What is known of a rig before.
+
+    Attributes:
+        cam_from_rig: (V, 4, 4).
+        place_sigma: (V,) standard deviation of each camera's place, in the same units.
+        rotation_sigma: (V,) of its rotation, radians.
+    """
 
     cam_from_rig: NDArray[np.float64]
-    place_sigma: float
-    rotation_sigma: float
+    place_sigma: NDArray[np.float64]
+    rotation_sigma: NDArray[np.float64]
 
 
 class Adjuster:
@@ -112,6 +119,8 @@ class Adjuster:
         extrinsic_prior: Holds the extrinsics of a rig softly; None where they are not refined.
 
     Attributes:
+        extrinsic_sigma: (V, 2) of the extrinsics as the last adjustment that freed them left them: of the place in the
+            units that they were given in, of the rotation in radians, in their worst direction; before, the prior's.
         alive: Called before every solve, and between the measurements of a global adjustment: a sign of life for a
             supervisor. What it raises ends the adjustment.
     """
@@ -125,6 +134,9 @@ class Adjuster:
         extrinsic_prior: ExtrinsicPrior | None = None,
     ) -> None:
         self.extrinsic_prior = extrinsic_prior
+        self.extrinsic_sigma: NDArray[np.float64] | None = None
+        if extrinsic_prior is not None:
+            self.extrinsic_sigma = np.stack((extrinsic_prior.place_sigma, extrinsic_prior.rotation_sigma), axis=1)
         self.settings = settings
         self.device = device
         self.focal_prior = focal_prior
@@ -179,7 +191,39 @@ class Adjuster:
         keyframes.intrinsics = result.state.intrinsics.cpu().numpy().astype(np.float64)
         if free_extrinsics and result.state.cam_from_rig is not None:
             keyframes.cam_from_rig = result.state.cam_from_rig.cpu().numpy()
+            self._take_extrinsics(keyframes, result)
         return result
+
+    def _take_extrinsics(self, keyframes: KeyframeMap, result: Result) -> None:
+        """Note how sure the extrinsics are, and let the rig have the size in the map at which it is most like it was
+        given.
+
+        No measurement knows the scale of map and rig together. The adjustment brings it to the prior's in ever smaller
+        steps; here it is solved for.
+        """
+        prior, covariances = self.extrinsic_prior, result.extrinsic_covariances
+        assert keyframes.cam_from_rig is not None
+        if prior is None or covariances is None or self.extrinsic_sigma is None:
+            return
+        weight = 1 / np.square(prior.place_sigma)[1:, None]
+        centres = [inverse(mounts)[:, :3, 3] for mounts in (keyframes.cam_from_rig, prior.cam_from_rig)]
+        found, given = (places[1:] - places[0] for places in centres)
+        size = float((weight * found * found).sum())
+        units = float((weight * found * given).sum()) / size if size > 0 else math.nan
+        if math.isfinite(units) and units > 0:
+            # The first camera stays where it is in the rig.
+            first = prior.cam_from_rig[0].copy()
+            first[:3, 3] /= units
+            keyframes.cam_from_rig = keyframes.cam_from_rig @ (inverse(keyframes.cam_from_rig[0]) @ first)
+            keyframes.rig_units = units
+        blocks = covariances.numpy()
+        for column, part in enumerate((slice(0, 3), slice(3, 6))):
+            variance = np.nan_to_num(blocks[:, part, part], nan=math.inf)
+            largest = [np.linalg.eigvalsh(block)[-1] if np.isfinite(block).all() else math.inf for block in variance]
+            unit = keyframes.rig_units if column == 0 else 1.0
+            sigma = unit * self.settings.focal_sigma_inflation * np.sqrt(np.maximum(largest, 0.0))
+            most = (prior.place_sigma, prior.rotation_sigma)[column]
+            self.extrinsic_sigma[:, column] = np.minimum(sigma, most)
 
     def _with_free_extrinsics(self, problem: Problem, keyframes: KeyframeMap) -> Problem:
         """Extrinsics are held softly where they were given, by sigmas of the same currency as the focal length's."""
@@ -189,11 +233,13 @@ class Adjuster:
         given = prior.cam_from_rig.copy()
         given[:, :3, 3] /= keyframes.rig_units
         inflation = self.settings.focal_sigma_inflation
-        sigmas = (prior.place_sigma / keyframes.rig_units / inflation, prior.rotation_sigma / inflation)
+        sigmas = np.stack((prior.place_sigma / keyframes.rig_units, prior.rotation_sigma), axis=1) / inflation
         return replace(
             problem,
             free=replace(problem.free, extrinsics=True),
-            priors=replace(problem.priors, cam_from_rig=torch.from_numpy(given), extrinsic_sigma=sigmas),
+            priors=replace(
+                problem.priors, cam_from_rig=torch.from_numpy(given), extrinsic_sigma=torch.from_numpy(sigmas)
+            ),
         )
 
     def probe(

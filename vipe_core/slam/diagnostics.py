@@ -154,7 +154,7 @@ def examine_loops(
 ) -> LoopReport:
     """Compare the map with what it was `before`, of the same keyframes."""
     loops = [(i, j) for i, j in graph if abs(keyframes.instant(i) - keyframes.instant(j)) > neighbours]
-    poses, depths, intrinsics, _ = before
+    poses, depths, intrinsics, *_ = before
     per_view = np.atleast_2d(intrinsics)
     errors_before: list[Array] = []
     errors_after: list[Array] = []

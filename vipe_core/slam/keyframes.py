@@ -16,12 +16,13 @@ Array = NDArray[Any]
 
 
 class Snapshot(NamedTuple):
-    """What adjustments change of a map: (K, 4, 4), (K, P), intrinsics, extrinsics of a rig."""
+    """What adjustments change of a map: (K, 4, 4), (K, P), intrinsics, extrinsics of a rig and their units."""
 
     poses: NDArray[np.float64]
     depths: NDArray[np.float32]
     intrinsics: NDArray[np.float64]
     cam_from_rig: NDArray[np.float64] | None
+    rig_units: float
 
 
 class KeyframeMap:
@@ -157,7 +158,7 @@ class KeyframeMap:
     def snapshot(self) -> Snapshot:
         """What adjustments change, to `restore` later."""
         extrinsics = None if self.cam_from_rig is None else self.cam_from_rig.copy()
-        return Snapshot(self.poses(), self.depths(), self.intrinsics.copy(), extrinsics)
+        return Snapshot(self.poses(), self.depths(), self.intrinsics.copy(), extrinsics, self.rig_units)
 
     def restore(self, snapshot: Snapshot) -> None:
         for k in range(len(snapshot.poses)):
@@ -165,6 +166,7 @@ class KeyframeMap:
             self.set_depth(k, snapshot.depths[k])
         self.intrinsics = np.array(snapshot.intrinsics, dtype=np.float64)
         self.cam_from_rig = None if snapshot.cam_from_rig is None else snapshot.cam_from_rig.copy()
+        self.rig_units = snapshot.rig_units
 
     def normalise_scale(self) -> None:
         """Rescale the world so that the median inverse depth is 1. Leaves every reprojection as it is."""

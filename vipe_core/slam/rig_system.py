@@ -200,10 +200,11 @@ class RigSlam:
         extent = _extent(rig.cam_from_rig)
         extrinsics = None
         if rig.refine:
+            place_sigma = rig.place_sigma_ratio * extent if extent > 0 else 1e-6
             extrinsics = ExtrinsicPrior(
                 np.array(rig.cam_from_rig),
-                rig.place_sigma_ratio * extent if extent > 0 else 1e-6,
-                math.radians(rig.rotation_sigma_deg),
+                np.full(views, place_sigma),
+                np.full(views, math.radians(rig.rotation_sigma_deg)),
             )
         adjuster = Adjuster(settings, self._device, prior, scale_px, extrinsics)
         measured = MeasuredGraph(
