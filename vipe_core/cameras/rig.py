@@ -6,7 +6,8 @@
         {"name": "right", "rig_from_cam": ...}]}
 
 `rig_from_cam` is 4x4, row by row, OpenCV axes. `extrinsics` is `fixed`, the default, or `refined`: all but the first
-view's are adjusted, around what is given. `camera` is a calibration (`calibration.py`); a view without one is
+view's are adjusted, around what is given; `sigma` of a view, `{"rotation_deg": 2, "place": 0.01}`, says how far off
+that may be. `camera` is a calibration (`calibration.py`); a view without one is
 estimated. `intrinsics` is `per_view`, the default, or `shared`: all views have one camera, which is estimated or
 adjusted as one. `metric` says that lengths are metres. `video` names a file beside the rig file.
 """
@@ -23,16 +24,31 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vipe_core.cameras.calibration import Calibration
+from vipe_core.cameras.calibration import Calibration, number_of
 from vipe_core.errors import ConfigError
 
 VERSION = 1
 _KEYS = {"version", "metric", "extrinsics", "intrinsics", "views"}
-_VIEW_KEYS = {"name", "video", "rig_from_cam", "camera"}
+_VIEW_KEYS = {"name", "video", "rig_from_cam", "sigma", "camera"}
 _MAX_VIEWS = 64
 _MAX_BYTES = 1 << 20
+# No body that carries cameras is larger than this; millimetres that are taken for metres are.
+_MAX_EXTENT_M = 100.0
 # Numbers that were written with few digits make a rotation that is one to about this.
 _RIGID = 1e-3
+
+
+@dataclass(frozen=True, slots=True)
+class ExtrinsicSigma:
+    """How sure the pose of a camera in its rig is, 1-sigma in the worst direction.
+
+    Attributes:
+        rotation_deg: Of its rotation.
+        place: Of its place, in the units of the rig.
+    """
+
+    rotation_deg: float
+    place: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,12 +60,21 @@ class RigView:
         rig_from_cam: (4, 4) float64.
         calibration: Where the camera is known.
         video: File that it recorded, relative to the rig file; None where it is given otherwise.
+        sigma: How sure `rig_from_cam` is. Where extrinsics are refined it says how far they may move, None what is
+            usual; what comes out of refining says how well they were found.
+
+    Raises:
+        ConfigError: `rig_from_cam` is not a rotation and a translation.
     """
 
     name: str
     rig_from_cam: NDArray[np.float64]
     calibration: Calibration | None = None
     video: str | None = None
+    sigma: ExtrinsicSigma | None = None
+
+    def __post_init__(self) -> None:
+        _rigid(self.rig_from_cam, f"view {self.name}")
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,7 +88,8 @@ class Rig:
         shared: All views have one camera.
 
     Raises:
-        ConfigError: Names repeat, there is only one view, or cameras that are said to be one differ.
+        ConfigError: Names or videos repeat, there is only one view, cameras that are said to be one differ, or the
+            rig is larger than any body.
     """
 
     views: tuple[RigView, ...]
@@ -77,6 +103,14 @@ class Rig:
         names = [view.name for view in self.views]
         if len(set(names)) < len(names):
             raise ConfigError(f"views of a rig need different names, got {', '.join(names)}")
+        videos = [view.video for view in self.views if view.video is not None]
+        if len(set(videos)) < len(videos):
+            raise ConfigError(f"every view of a rig has a video of its own, got {', '.join(videos)}")
+        if self.metric and self.extent > _MAX_EXTENT_M:
+            raise ConfigError(
+                f"the cameras of the rig are up to {self.extent:g} m apart; give `rig_from_cam` in metres, or leave "
+                "`metric` out"
+            )
         known = [view.calibration for view in self.views if view.calibration is not None]
         if self.shared and any(one != known[0] for one in known):
             raise ConfigError("the views of the rig are said to share one camera, but their calibrations differ")
@@ -128,6 +162,8 @@ class Rig:
             if view.video is not None:
                 row["video"] = view.video
             row["rig_from_cam"] = view.rig_from_cam.tolist()
+            if view.sigma is not None:
+                row["sigma"] = {"rotation_deg": view.sigma.rotation_deg, "place": view.sigma.place}
             if view.calibration is not None:
                 row["camera"] = view.calibration.to_json()
             views.append(row)
@@ -172,7 +208,19 @@ def _view(data: Any, name: str) -> RigView:
     if camera is not None and not isinstance(camera, dict):
         raise ConfigError(f"{name}: `camera` must be a calibration, got {camera!r}")
     calibration = None if camera is None else Calibration.from_json(camera, f"{name}: camera")
-    return RigView(title, _rigid(data.get("rig_from_cam"), name), calibration, video)
+    return RigView(title, _rigid(data.get("rig_from_cam"), name), calibration, video, _sigma(data.get("sigma"), name))
+
+
+def _sigma(value: Any, name: str) -> ExtrinsicSigma | None:
+    if value is None:
+        return None
+    if not isinstance(value, dict):
+        raise ConfigError(f"{name}: `sigma` must be an object with `rotation_deg` and `place`, got {value!r}")
+    _known_keys(value, {"rotation_deg", "place"}, f"{name}: sigma")
+    rotation_deg, place = (number_of(value, key, f"{name}: sigma") for key in ("rotation_deg", "place"))
+    if rotation_deg <= 0 or place < 0:
+        raise ConfigError(f"{name}: `sigma` must be positive, got {rotation_deg:g} degrees and {place:g}")
+    return ExtrinsicSigma(rotation_deg, place)
 
 
 def _rigid(value: Any, name: str) -> NDArray[np.float64]:

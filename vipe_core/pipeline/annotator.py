@@ -128,7 +128,7 @@ class Annotator:
         source = open_source(video, name=name) if isinstance(video, (str, Path)) else video
         if masks is not None:
             source = MaskedView(source, masks)
-        given = _given(calibration, source)
+        given = known_camera(calibration, source)
         report = Reporter(progress)
         instances: InstanceMaps | None = None
         masks_start_s = time.perf_counter()
@@ -137,15 +137,14 @@ class Annotator:
                 instances = find_instances(source, self._masks, report)
             source = InstanceView(source, instances)
         masks_s = time.perf_counter() - masks_start_s
-        if given is not None and given.camera.distorted:
-            source = ResampledView(source, Resampling.of(given.camera))
+        source = undistorted(source, given)
 
         with typed_errors(source, report), torch.inference_mode():
             if given is None:
                 result = self._slam(self._model(source)).run(source, report)
             else:
                 slam = Slam(self._priors(), self.preset.slam, self.device)
-                result = slam.run(source, report, _solved(given, source))
+                result = slam.run(source, report, camera_to_solve(given, source))
             quality = assess(result, self.preset.slam, source.info.width)
             scaled = set_scale(scene_of(result), source, known, self._depth.metric, report)
             quality = dataclasses.replace(quality, scale_sigma_ratio=scaled.sigma_ratio)
@@ -163,7 +162,7 @@ class Annotator:
         return Annotation(
             name=source.info.name,
             world_from_cam=scaled.scene.world_from_cam,
-            camera=_final_camera(result.camera, given, source),
+            camera=camera_of_pictures(result.camera, given, source),
             timestamps_s=result.timestamps_s,
             fps=source.info.fps,
             keyframes=result.keyframes,
@@ -270,7 +269,7 @@ class Annotator:
         return AlignedDepth(self._depth, self.preset.alignment, metres=scaled.scale == "metric")
 
 
-def _given(calibration: Calibration | str | Path | None, source: FrameSource) -> Calibration | None:
+def known_camera(calibration: Calibration | str | Path | None, source: FrameSource) -> Calibration | None:
     """The calibration at the size of the source."""
     if calibration is None:
         return None
@@ -278,14 +277,21 @@ def _given(calibration: Calibration | str | Path | None, source: FrameSource) ->
     return known.for_size(source.info.width, source.info.height, source.info.name)
 
 
-def _solved(given: Calibration | None, source: FrameSource) -> Calibration | None:
+def undistorted(source: FrameSource, given: Calibration | None) -> FrameSource:
+    """The pictures that are worked with: resampled where they are of a lens with measured distortion."""
+    if given is None or not given.camera.distorted:
+        return source
+    return ResampledView(source, Resampling.of(given.camera))
+
+
+def camera_to_solve(given: Calibration | None, source: FrameSource) -> Calibration | None:
     """The calibration of the pictures that are worked with."""
     if given is not None and isinstance(source, ResampledView):
         return dataclasses.replace(given, camera=source.resampling.ideal)
     return given
 
 
-def _final_camera(found: Camera, given: Calibration | None, source: FrameSource) -> Camera:
+def camera_of_pictures(found: Camera, given: Calibration | None, source: FrameSource) -> Camera:
     """The camera of the pictures as they are."""
     if given is not None and given.use == "fixed":
         return given.camera

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import logging
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -13,14 +14,21 @@ import torch
 from numpy.typing import NDArray
 
 from vipe_core.annotation import Annotation, ProgressCallback, depth_kind_of
-from vipe_core.cameras import Camera
 from vipe_core.cameras.calibration import Calibration
-from vipe_core.cameras.rig import Rig, RigView, read_rig
+from vipe_core.cameras.rig import ExtrinsicSigma, Rig, read_rig
 from vipe_core.depth.known import KnownLength
 from vipe_core.depth.scene import scene_of
 from vipe_core.errors import ConfigError
 from vipe_core.geometry.arrays import inverse
-from vipe_core.pipeline.annotator import Annotator, Reporter, typed_errors
+from vipe_core.pipeline.annotator import (
+    Annotator,
+    Reporter,
+    camera_of_pictures,
+    camera_to_solve,
+    known_camera,
+    typed_errors,
+    undistorted,
+)
 from vipe_core.pipeline.scaling import RigSize, ScaledScene, set_rig_scale
 from vipe_core.quality import assess
 from vipe_core.slam.rig_system import RigCameras, RigSlam, RigSlamResult
@@ -90,29 +98,32 @@ class RigAnnotator(Annotator):
             open_source(video, name=name) if isinstance(video, (str, Path)) else video
             for video, name in zip(_videos(known, beside, videos), names or titles, strict=True)
         ]
-        source = SynchronisedSource(opened, titles)
+        given = [known_camera(one, video) for one, video in zip(_calibrations(known), opened, strict=True)]
+        solved = [undistorted(one, camera) for one, camera in zip(opened, given, strict=True)]
+        source = SynchronisedSource(solved, titles)
         report = Reporter(progress)
-        given = [_given(view, one) for view, one in zip(known.views, opened, strict=True)]
         with typed_errors(opened[0], report), torch.inference_mode():
             slam = RigSlam(priors, self.preset.slam, self.device)
-            result = slam.run(source, _cameras(known, given), report)
+            cameras = [camera_to_solve(camera, one) for camera, one in zip(given, solved, strict=True)]
+            result = slam.run(source, _cameras(known, cameras), report)
             size = RigSize(known.metric, result.rig_units, result.scale_sigma_ratio)
             scenes = [scene_of(view) for view in result.views]
-            scaled, factor = set_rig_scale(scenes, opened[0], known_length, self._depth.metric, size, report)
+            scaled, factor = set_rig_scale(scenes, solved[0], known_length, self._depth.metric, size, report)
         views = []
-        for number, one in enumerate(opened):
-            found, calibration = result.views[number], given[number]
-            camera = found.camera.resized(one.info.width, one.info.height)
-            if calibration is not None and calibration.use == "fixed":
-                camera = calibration.camera
-            views.append(self._annotation(one, found, scaled[number], camera, report))
+        for number, one in enumerate(solved):
+            views.append(self._annotation(one, result.views[number], scaled[number], given[number], report))
         logger.info("%s: %d views, scale %s", opened[0].info.name, len(views), views[0].scale)
         refined = _refined(known, result, factor, views)
         world_from_rig = views[0].world_from_cam @ inverse(refined.views[0].rig_from_cam)
         return RigAnnotation(tuple(views), refined, world_from_rig)
 
     def _annotation(
-        self, source: FrameSource, found: SlamResult, scaled: ScaledScene, camera: Camera, report: Reporter
+        self,
+        source: FrameSource,
+        found: SlamResult,
+        scaled: ScaledScene,
+        given: Calibration | None,
+        report: Reporter,
     ) -> Annotation:
         """One view by itself."""
         timings = dict(found.timings_s)
@@ -120,14 +131,14 @@ class RigAnnotator(Annotator):
         return Annotation(
             name=source.info.name,
             world_from_cam=scaled.scene.world_from_cam,
-            camera=camera,
+            camera=camera_of_pictures(found.camera, given, source),
             timestamps_s=found.timestamps_s,
             fps=source.info.fps,
             keyframes=found.keyframes,
             scale=scaled.scale,
-            depth_kind=depth_kind_of(camera),
+            depth_kind=depth_kind_of(found.camera),
             quality=dataclasses.replace(quality, scale_sigma_ratio=scaled.sigma_ratio),
-            provenance=self._provenance(source, scaled),
+            provenance=self._provenance(source, scaled, given),
             dense=lambda: self._dense(source, scaled, None, timings, report),
             timings_s=timings,
         )
@@ -147,25 +158,22 @@ def _videos(
     return [(beside or Path()) / view.video for view in rig.views if view.video is not None]
 
 
-def _given(view: RigView, source: FrameSource) -> Calibration | None:
-    """The calibration of a view at the size of its video."""
-    if view.calibration is None:
-        return None
-    model = view.calibration.camera.model
-    if model not in ("pinhole", "mei"):
-        raise ConfigError(f"view {view.name}: a rig takes pinhole and mei cameras, not {model}; undistort its video")
-    info = source.info
-    return view.calibration.for_size(info.width, info.height, info.name)
+def _calibrations(rig: Rig) -> list[Calibration | None]:
+    """Of the views; one that they share is that of all."""
+    own = [view.calibration for view in rig.views]
+    return [next((one for one in own if one is not None), None)] * len(own) if rig.shared else own
 
 
 def _cameras(rig: Rig, given: Sequence[Calibration | None]) -> RigCameras:
     known = [calibration for calibration in given if calibration is not None]
+    sigmas = [None if view.sigma is None else (view.sigma.place, view.sigma.rotation_deg) for view in rig.views]
     return RigCameras(
         rig.cam_from_rig,
         tuple(None if calibration is None else calibration.camera for calibration in given),
         held=all(calibration.use == "fixed" for calibration in known),
         shared=rig.shared,
         refine=rig.refine,
+        extrinsic_sigma=np.array([(math.nan, math.nan) if one is None else one for one in sigmas]),
     )
 
 
@@ -173,8 +181,11 @@ def _refined(rig: Rig, result: RigSlamResult, factor: float, views: Sequence[Ann
     """The rig in units of the trajectories, with the cameras of the views."""
     mounts = inverse(result.cam_from_rig)
     mounts[:, :3, 3] *= factor
-    refined = [
-        replace(view, rig_from_cam=mount, calibration=Calibration(found.camera), video=None)
-        for view, mount, found in zip(rig.views, mounts, views, strict=True)
-    ]
+    refined = []
+    for number, (view, mount, found) in enumerate(zip(rig.views, mounts, views, strict=True)):
+        sigma = view.sigma
+        if rig.refine and number > 0 and (one := result.views[number].rig) is not None:
+            sigma = ExtrinsicSigma(one.rotation_sigma_deg, one.place_sigma / result.rig_units * factor)
+        known = Calibration(found.camera)
+        refined.append(replace(view, rig_from_cam=mount, calibration=known, video=None, sigma=sigma))
     return replace(rig, views=tuple(refined), metric=views[0].scale == "metric")

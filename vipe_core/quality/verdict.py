@@ -15,6 +15,10 @@ Reason codes are stable: they are stored with every video.
     weak_link           two parts of a shot hang together by almost nothing: a blur, a jump
     shot_cut            the video has cuts: shots are right by themselves, what lies between them is not measured
     interpolated_frames frames whose own pose fit failed, or that show nothing
+    blind_view          a view of a rig that shows nothing, or stands still while the others move: its poses are those
+                        that the others found, and nothing measures its depth
+    extrinsics_unobserved  the recording does not say how this view of a rig is turned against the first: it was to be
+                        refined, but its rotation is hardly surer than before
 """
 
 from __future__ import annotations
@@ -24,6 +28,7 @@ import math
 import numpy as np
 
 from vipe_core.annotation import Quality, Reliability
+from vipe_core.slam.diagnostics import MapReport
 from vipe_core.slam.settings import SlamSettings
 from vipe_core.slam.system import SlamResult
 
@@ -40,6 +45,8 @@ _VERY_LOW_INLIERS = 0.4
 _WEAK_LINK = 0.08
 _MAX_INTERPOLATED = 0.02
 _MOSTLY_INTERPOLATED = 0.5
+# Half a degree is a tenth of the picture of a telephoto lens, and 9 cm at ten metres.
+_UNOBSERVED_ROTATION_DEG = 0.5
 # A sigma of log(f) beyond this says nothing more.
 _NO_IDEA = 1.0
 
@@ -66,22 +73,18 @@ def assess(result: SlamResult, settings: SlamSettings, source_width: int) -> Qua
             reasons.append("pure_rotation")
         elif found.parallax_deg < _LOW_PARALLAX_DEG:
             reasons.append("low_parallax")
-        if found.coverage < _LOW_COVERAGE:
-            reasons.append("low_texture")
-        # Written so that a NaN residual, of a map without a single measurement, counts as high.
-        width = result.working.width / (2.75 if panorama else 1)
-        high_px = max(_MATCHING_NOISE_PX, _HIGH_RESIDUAL_RATIO * width)
-        if not found.residual_px <= high_px:
-            reasons.append("high_residual")
-            fatal = not found.residual_px <= _VERY_HIGH * high_px
-        if found.inlier_ratio < _LOW_INLIERS:
-            reasons.append("low_inliers")
-            fatal = fatal or found.inlier_ratio < _VERY_LOW_INLIERS
-        # Each of them can have an honest cause (walls, moving things, a bad lens); together they say that nothing fits.
-        fatal = fatal or len({"low_texture", "high_residual", "low_inliers"} & set(reasons)) > 1
+        if result.rig is not None and result.rig.blind:
+            reasons.append("blind_view")
+            fatal = True
+        else:
+            width = result.working.width / (2.75 if panorama else 1)
+            misfits, fatal = _misfits(found, max(_MATCHING_NOISE_PX, _HIGH_RESIDUAL_RATIO * width))
+            reasons += misfits
         if found.weakest_link < _WEAK_LINK:
             reasons.append("weak_link")
             fatal = True
+    if result.rig is not None and result.rig.rotation_sigma_deg > _UNOBSERVED_ROTATION_DEG:
+        reasons.append("extrinsics_unobserved")
     if result.zoom.changes:
         reasons.append("zoom")
     if result.cuts:
@@ -119,6 +122,22 @@ def assess(result: SlamResult, settings: SlamSettings, source_width: int) -> Qua
         loop_residual_after_px=result.loops.residual_after_px * to_source,
         loop_moved_ratio=result.loops.moved_ratio,
     )
+
+
+def _misfits(found: MapReport, high_px: float) -> tuple[list[str], bool]:
+    """What of the picture was not measured or does not fit, and whether that leaves nothing to rely on."""
+    reasons, fatal = [], False
+    if found.coverage < _LOW_COVERAGE:
+        reasons.append("low_texture")
+    # Written so that a NaN residual, of a map without a single measurement, counts as high.
+    if not found.residual_px <= high_px:
+        reasons.append("high_residual")
+        fatal = not found.residual_px <= _VERY_HIGH * high_px
+    if found.inlier_ratio < _LOW_INLIERS:
+        reasons.append("low_inliers")
+        fatal = fatal or found.inlier_ratio < _VERY_LOW_INLIERS
+    # Each of them can have an honest cause (walls, moving things, a bad lens); together they say that nothing fits.
+    return reasons, fatal or len(reasons) > 1
 
 
 def _fov_interval_deg(result: SlamResult) -> tuple[float, float]:

@@ -366,7 +366,7 @@ def judge(seen: Iterable[tuple[Induced, Match, Array]], robust_scale_px: float) 
         seen: Where it sees the cells of a keyframe, their measurement, and (P,) bool, which of them count.
     """
     inside = total = coverage = 0.0
-    errors = []
+    errors = [np.zeros(0, np.float32)]
     for induced, match, usable in seen:
         weight = match.weight.mean(axis=1) * usable
         weight = np.where(weight > _MIN_WEIGHT, weight, 0)

@@ -27,6 +27,7 @@ class MeasuredGraph:
         sparse: Gives the sparse term; None leaves it out.
         dense_flow: Whether the dense term is filed, or only guides the sparse one.
         aligner: Sharpens the dense term once the geometry is known; None leaves it as it is.
+        blind: Views of a rig that are not measured.
     """
 
     def __init__(
@@ -40,7 +41,9 @@ class MeasuredGraph:
         *,
         dense_flow: bool = True,
         aligner: Aligner | None = None,
+        blind: frozenset[int] = frozenset(),
     ) -> None:
+        self.blind = blind
         self.keyframes = keyframes
         self.graph = graph
         self._matcher = matcher
@@ -51,7 +54,7 @@ class MeasuredGraph:
         self._aligner = aligner if dense_flow else None
 
     def of(self, keyframes: KeyframeMap, graph: Graph) -> MeasuredGraph:
-        """The same way of measuring for another map."""
+        """The same way of measuring for another map, of one view."""
         return MeasuredGraph(
             keyframes,
             graph,
@@ -80,8 +83,10 @@ class MeasuredGraph:
             min_consistent: A match with less forward-backward consistency is not filed.
 
         Returns:
-            The smaller consistency of the two directions.
+            The smaller consistency of the two directions; 0 where one end is blind.
         """
+        if self._blind(i, j):
+            return 0.0
         source, target = self.keyframes.features[i], self.keyframes.features[j]
         guess_px = None
         if guided:
@@ -104,12 +109,18 @@ class MeasuredGraph:
 
     def connect_by_points(self, i: int, j: int, min_consistent: float) -> float:
         """Measure i -> j and j -> i wherever the cameras are, from sparse correspondences; 0 when there are too few."""
+        if self._blind(i, j):
+            return 0.0
         points = self._correspond(i, j)
         if len(points) < _MIN_POINTS:
             return 0.0
         source, target = self.keyframes.features[i], self.keyframes.features[j]
         there, back = self._matcher.match(source, target, displacement_guess(points, self.keyframes.grid))
         return self._file(i, j, there, back, min_consistent)
+
+    def _blind(self, i: int, j: int) -> bool:
+        views = self.keyframes.num_views
+        return i % views in self.blind or j % views in self.blind
 
     def _correspond(self, i: int, j: int) -> Correspondences:
         if self._points is None:

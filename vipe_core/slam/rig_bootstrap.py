@@ -78,7 +78,8 @@ class RigBootstrap:
 
     def run(self, first: Sequence[Keyframe], times_s: Sequence[float]) -> None:
         """Fill the empty map with the instants `first`."""
-        starts = [self._alone(view, first, times_s) for view in range(self._keyframes.num_views)]
+        seeing = [view for view in range(self._keyframes.num_views) if view not in self._measured.blind]
+        starts = [self._alone(view, first, times_s) for view in seeing]
         flat = np.ones(self._keyframes.grid.num_cells)
         for keyframe, time_s in zip(first, times_s, strict=True):
             instant = len(self._keyframes) // self._keyframes.num_views
@@ -136,7 +137,8 @@ class RigBootstrap:
         if self._keyframes.intrinsics.ndim == 1:
             self._keyframes.intrinsics = min(starts, key=lambda one: one.cost).keyframes.intrinsics.copy()
         else:
-            self._keyframes.intrinsics = np.stack([start.keyframes.intrinsics for start in starts])
+            for start in starts:
+                self._keyframes.intrinsics[start.view] = start.keyframes.intrinsics
 
     def _connect_at_infinity(self) -> None:
         """Match views of one instant that overlap for what is far away."""

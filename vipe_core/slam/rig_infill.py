@@ -53,8 +53,12 @@ def fill_in_rig(
     report: Report,
     aligner: Aligner | None = None,
     tracks_only: SparseTracker | None = None,
+    blind: frozenset[int] = frozenset(),
 ) -> list[Trajectory]:
     """Pose every instant against the finished map; arguments as `fill_in`.
+
+    Args:
+        blind: Views that measure nothing.
 
     Returns:
         The trajectory of every view. They are rigid to each other.
@@ -62,7 +66,7 @@ def fill_in_rig(
     Raises:
         InputError, DecodeError: From the source.
     """
-    infill = _RigInfill(shot_map, frames, placed, reprojector, batch, aligner, tracks_only)
+    infill = _RigInfill(shot_map, frames, placed, reprojector, batch, aligner, tracks_only, blind)
     if shot_map.motion != "static":
         with closing(frames.again()) as stream:
             for index, features in stream:
@@ -90,7 +94,9 @@ class _RigInfill:
         batch: int,
         aligner: Aligner | None,
         tracks_only: SparseTracker | None,
+        blind: frozenset[int],
     ) -> None:
+        self._blind = blind
         self._map = shot_map
         self._keyframes = keyframes = shot_map.keyframes
         assert keyframes.cam_from_rig is not None
@@ -170,6 +176,8 @@ class _RigInfill:
         sightings = []
         views = self._keyframes.num_views
         for view, seen in enumerate(features):
+            if view in self._blind:
+                continue
             said = np.zeros(self._keyframes.grid.num_cells, dtype=np.float32)
             for instant in sorted(nearest):
                 k = instant * views + view

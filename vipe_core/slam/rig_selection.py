@@ -25,6 +25,7 @@ class RigSelection:
         timestamps_s: (N,) float64 presentation time of every instant.
         keyframes: At least one, in time order; the features are a tuple of the views'.
         max_motion_px: Largest displacement of any view against its keyframe, working pixels.
+        blind: Views that show nothing, or stand still while others move: black, covered, frozen.
         placed: (N,) bool, False on instants at which no view shows anything.
         samples: For every view, evenly thinned frames.
     """
@@ -32,20 +33,27 @@ class RigSelection:
     timestamps_s: NDArray[np.float64]
     keyframes: list[Keyframe]
     max_motion_px: float
+    blind: frozenset[int]
     placed: NDArray[np.bool_]
     samples: list[list[WorkingFrame]]
 
 
 class _AnyView:
-    """The motion of a rig is that of the view in which it is seen best."""
+    """The motion of a rig is that of the view in which it is seen best.
 
-    def __init__(self, matcher: DenseMatcher) -> None:
+    Attributes:
+        largest_px: Of each view.
+    """
+
+    def __init__(self, matcher: DenseMatcher, num_views: int) -> None:
         self._matcher = matcher
+        self.largest_px = [0.0] * num_views
 
     def motion_px(self, source: Sequence[Any], target: Sequence[Any]) -> float:
         moved = [self._matcher.motion_px(a, b) for a, b in zip(source, target, strict=True)]
-        finite = [motion for motion in moved if np.isfinite(motion)]
-        return max(finite, default=0.0)
+        finite = [motion if np.isfinite(motion) else 0.0 for motion in moved]
+        self.largest_px = [max(pair) for pair in zip(self.largest_px, finite, strict=True)]
+        return max(finite)
 
 
 def select_rig_keyframes(frames: EncodedRig, size: WorkingSize, settings: SlamSettings, report: Report) -> RigSelection:
@@ -63,7 +71,9 @@ def select_rig_keyframes(frames: EncodedRig, size: WorkingSize, settings: SlamSe
     matcher = frames.matcher
     thinned = [Thinned(settings.sample_frames) for _ in range(frames.num_views)]
     static_px = settings.scaled_px(settings.static_motion_px, size.width)
-    found = MotionFilter(_AnyView(matcher), settings.scaled_px(settings.keyframe_motion_px, size.width))
+    keyframe_px = settings.scaled_px(settings.keyframe_motion_px, size.width)
+    motion = _AnyView(matcher, frames.num_views)
+    found = MotionFilter(motion, keyframe_px)
     first: Keyframe | None = None
     blank: set[int] = set()
     with closing(frames.first_pass()) as first_pass:
@@ -92,10 +102,13 @@ def select_rig_keyframes(frames: EncodedRig, size: WorkingSize, settings: SlamSe
     placed = np.ones(len(frames), dtype=np.bool_)
     placed[list(blank)] = False
     assert first is not None
+    moves = max(motion.largest_px) >= keyframe_px
+    still = (view for view, largest_px in enumerate(motion.largest_px) if largest_px < static_px)
     return RigSelection(
         np.array(frames.times_s, dtype=np.float64),
         found.keyframes or [first],
         found.max_motion_px,
+        frozenset(still) if moves else frozenset(),
         placed,
         [sample.frames for sample in thinned],
     )

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -35,13 +35,17 @@ from vipe_core.slam.rig_selection import RigSelection, select_rig_keyframes
 from vipe_core.slam.rig_tracking import RigTracker
 from vipe_core.slam.selection import Report, Shot
 from vipe_core.slam.settings import SlamSettings
-from vipe_core.slam.system import SlamResult
+from vipe_core.slam.system import SlamResult, ViewOfRig, with_pixels_of
 from vipe_core.slam.timing import StageClock
 from vipe_core.slam.working import WorkingSize, working_size
 from vipe_core.video.source import VideoInfo
 
 # How closely the focal length of a calibration that is a starting point holds.
 _CALIBRATED_SIGMA = 0.02
+# How far off extrinsics that are to be refined are thought to be: of the size of the rig, and degrees.
+_PLACE_SIGMA_RATIO = 0.02
+_ROTATION_SIGMA_DEG = 2.0
+_LEAST_SIGMA_RATIO = 1e-6
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,12 +54,12 @@ class RigCameras:
 
     Attributes:
         cam_from_rig: (V, 4, 4) float64.
-        cameras: Of the views, at the sizes of their videos; None is estimated.
+        cameras: Of the views, at the sizes of their videos, `pinhole` or `mei`; None is estimated.
         held: Known cameras are not adjusted.
         shared: All views have one camera: it is estimated or adjusted as one.
         refine: Adjust the extrinsics but for view 0.
-        place_sigma_ratio: How far off a camera's place may be, as a share of the size of the rig.
-        rotation_sigma_deg: How far off its rotation may be.
+        extrinsic_sigma: (V, 2) how far off they may then be, 1-sigma: a camera's place, in the units of the extrinsics,
+            and its rotation in degrees; NaN for 2 % of the size of the rig, and for 2 degrees.
     """
 
     cam_from_rig: NDArray[np.float64]
@@ -63,8 +67,20 @@ class RigCameras:
     held: bool = True
     shared: bool = False
     refine: bool = False
-    place_sigma_ratio: float = 0.02
-    rotation_sigma_deg: float = 2.0
+    extrinsic_sigma: NDArray[np.float64] | None = None
+
+    def prior(self) -> ExtrinsicPrior | None:
+        """What holds the extrinsics while they are adjusted; None where they are not."""
+        if not self.refine:
+            return None
+        extent = _extent(self.cam_from_rig)
+        usual = np.array([_PLACE_SIGMA_RATIO * extent, _ROTATION_SIGMA_DEG])
+        sigma = np.tile(usual, (len(self.cameras), 1))
+        if self.extrinsic_sigma is not None:
+            sigma = np.where(np.isfinite(self.extrinsic_sigma), self.extrinsic_sigma, usual)
+        # Cameras in one place stay there.
+        place = np.maximum(sigma[:, 0], _LEAST_SIGMA_RATIO * extent if extent > 0 else 1e-6)
+        return ExtrinsicPrior(np.array(self.cam_from_rig), place, np.radians(sigma[:, 1]))
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,13 +117,12 @@ class RigSlam:
 
         Raises:
             InputError, DecodeError: From the source; EmptyMedia when it holds no frame.
-            ConfigError: The rig has another number of views, or cameras of several models.
+            ConfigError: The rig has another number of views.
         """
         if len(source.infos) != len(rig.cameras):
             raise ConfigError(f"the rig has {len(rig.cameras)} views, but there are {len(source.infos)} videos")
         clock, settings = StageClock(), self._settings
-        first = source.infos[0]
-        size = working_size(first.width, first.height, settings.working_area_px)
+        size = _common_size(source.infos, rig.cameras, settings.working_area_px)
         frames = EncodedRig(source, size, self._priors.matcher, settings.frame_cache_bytes)
         with clock("scan"):
             selection = select_rig_keyframes(frames, size, settings, report)
@@ -127,12 +142,14 @@ class RigSlam:
                 report,
                 self._priors.aligner if dense else None,
                 None if dense else self._priors.tracker,
+                selection.blind,
             )
             frames.release()
         keyframes = done.keyframes
         assert keyframes.cam_from_rig is not None
+        views = _views(done, trajectories, selection, size, clock.seconds)
         return RigSlamResult(
-            _views(done, trajectories, selection, size, clock.seconds),
+            tuple(_in_its_model(view, camera) for view, camera in zip(views, rig.cameras, strict=True)),
             keyframes.cam_from_rig,
             keyframes.rig_units,
             sigma,
@@ -158,7 +175,7 @@ class RigSlam:
             sigmas.append(estimate.log_focal_sigma)
             rivals = tuple(math.log(rival_px) for rival_px in estimate.rivals_px) if rig.shared else ()
         if len({camera.model for camera in cameras}) > 1:
-            raise ConfigError("all views of a rig need cameras of one model, pinhole or mei")
+            cameras = [_unified(camera) for camera in cameras]
         held = rig.held and all(camera is not None for camera in rig.cameras)
         if rig.shared:
             best = int(np.argmin(sigmas))
@@ -169,13 +186,8 @@ class RigSlam:
         return cameras, FocalPrior(logs[0], max(sigmas), rivals, held=held, of_views=logs if len(logs) > 1 else ())
 
     def _estimate(self, info: VideoInfo, selection: RigSelection, view: int, size: WorkingSize) -> IntrinsicsEstimate:
-        """With pixels that are square in the source video."""
         estimate = self._priors.intrinsics.estimate(selection.samples[view], size.grid)
-        scale = math.sqrt(size.width / info.width * size.height / info.height)
-        focal_px = estimate.camera.focal_px / scale
-        own = (focal_px, focal_px, info.width / 2, info.height / 2, *estimate.camera.params[4:])
-        camera = Camera(estimate.camera.model, own, info.width, info.height).resized(*size.size)
-        return IntrinsicsEstimate(camera, estimate.log_focal_sigma, estimate.num_pairs, estimate.rivals_px)
+        return with_pixels_of(info, estimate, size)
 
     # -- the map ---------------------------------------------------------------------------------------------------
 
@@ -197,15 +209,7 @@ class RigSlam:
             size.grid, cameras[0].model, intrinsics[0] if len(intrinsics) == 1 else intrinsics, rig.cam_from_rig
         )
         graph = Graph()
-        extent = _extent(rig.cam_from_rig)
-        extrinsics = None
-        if rig.refine:
-            place_sigma = rig.place_sigma_ratio * extent if extent > 0 else 1e-6
-            extrinsics = ExtrinsicPrior(
-                np.array(rig.cam_from_rig),
-                np.full(views, place_sigma),
-                np.full(views, math.radians(rig.rotation_sigma_deg)),
-            )
+        extent, extrinsics = _extent(rig.cam_from_rig), rig.prior()
         adjuster = Adjuster(settings, self._device, prior, scale_px, extrinsics)
         measured = MeasuredGraph(
             keyframes,
@@ -216,6 +220,7 @@ class RigSlam:
             reprojector,
             dense_flow=settings.terms.dense_flow,
             aligner=self._priors.aligner,
+            blind=selection.blind,
         )
         masks = MotionMasks(
             reprojector, keyframes, graph, adjuster.robust_scale_px, enabled=settings.terms.motion_masks
@@ -248,7 +253,8 @@ class RigSlam:
             told = extent > 0 and not static and (overlap or not rig.refine)
             sigma = backend.rig_scale_sigma() if told else math.inf
             # Nor do more measurements average away what is wrong with the cameras, or with the places that they have.
-            sigma = math.hypot(sigma, settings.lens_sigma, rig.place_sigma_ratio if rig.refine else 0.0)
+            places = 0.0 if extrinsics is None or extent <= 0 else float(extrinsics.place_sigma.max()) / extent
+            sigma = math.hypot(sigma, settings.lens_sigma, places)
             adjuster.alive = _nothing
             report("backend", 1, 1)
         found = examine(reprojector, keyframes, graph, adjuster.robust_scale_px)
@@ -315,6 +321,7 @@ def _views(
                 motion=done.motion,
                 focal_sigma_ratio=done.focal_sigma_ratio,
                 map=_of_view(done.found, rows),
+                rig=_of_rig(done.adjuster, selection, view),
                 loops=LoopReport(
                     done.loops.edges,
                     done.loops.residual_before_px,
@@ -328,11 +335,14 @@ def _views(
 
 
 def _of_view(found: MapReport, rows: slice) -> MapReport:
-    """The numbers of the whole map, with the keyframes of one view."""
+    """The numbers of the keyframes of one view; what holds the map together, and its parallax, are the rig's."""
+    coverage = found.keyframe_coverage[rows]
+    residual_px = found.keyframe_residual_px[rows]
+    measured = np.isfinite(residual_px)
     return MapReport(
-        residual_px=found.residual_px,
-        inlier_ratio=found.inlier_ratio,
-        coverage=found.coverage,
+        residual_px=float(np.median(residual_px[measured])) if measured.any() else math.nan,
+        inlier_ratio=float(found.keyframe_inlier_ratio[rows][measured].mean()) if measured.any() else 0.0,
+        coverage=float(coverage.mean()),
         weakest_link=found.weakest_link,
         parallax_deg=found.parallax_deg,
         confidence=found.confidence[rows],
@@ -340,3 +350,41 @@ def _of_view(found: MapReport, rows: slice) -> MapReport:
         keyframe_inlier_ratio=found.keyframe_inlier_ratio[rows],
         keyframe_coverage=found.keyframe_coverage[rows],
     )
+
+
+def _of_rig(adjuster: Adjuster, selection: RigSelection, view: int) -> ViewOfRig:
+    blind = view in selection.blind
+    if view == 0 or adjuster.extrinsic_sigma is None:
+        return ViewOfRig(blind)
+    place, rotation = adjuster.extrinsic_sigma[view]
+    return ViewOfRig(blind, math.degrees(rotation), float(place))
+
+
+def _common_size(infos: Sequence[VideoInfo], cameras: Sequence[Camera | None], area_px: int) -> WorkingSize:
+    """The working size of all views: the mean shape of their pictures."""
+    shapes = []
+    for info, camera in zip(infos, cameras, strict=True):
+        aspect = info.pixel_aspect if camera is None else camera.params[1] / camera.params[0]
+        shapes.append((info.width, info.height, aspect))
+    if len(set(shapes)) == 1:
+        width, height, aspect = shapes[0]
+    else:
+        width, height, aspect = np.exp(np.log(shapes).mean(axis=0)).tolist()
+    return working_size(round(width), round(height), area_px, pixel_aspect=aspect)
+
+
+def _unified(camera: Camera) -> Camera:
+    """A pinhole as the unified camera that it is a case of."""
+    if camera.model == "mei":
+        return camera
+    return Camera("mei", (*camera.params, 0.0), camera.width, camera.height)
+
+
+def _in_its_model(result: SlamResult, known: Camera | None) -> SlamResult:
+    """A view whose camera is a known pinhole, where it was a unified camera among others, and stayed what it was."""
+    camera = result.camera
+    if known is None or known.model != "pinhole" or camera.model != "mei" or camera.params[4] != 0:
+        return result
+    rays = camera.unproject(result.grid.sample_px().numpy())
+    pinhole = Camera("pinhole", camera.params[:4], camera.width, camera.height)
+    return replace(result, camera=pinhole, inverse_depth=(result.inverse_depth / rays[:, 2]).astype(np.float32))

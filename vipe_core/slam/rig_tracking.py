@@ -50,6 +50,8 @@ class RigTracker:
         new = range(instant * views, (instant + 1) * views)
         reach = self._settings.neighbours
         for k in new:
+            if k % views in self._measured.blind:
+                continue
             # The step from the previous instant is within the matcher's own reach, and the prediction may be wrong.
             consistent = self._measured.connect(k - views, k, guided=False)
             reach = max(reach, self._measured.reach(consistent, self._settings.neighbours))

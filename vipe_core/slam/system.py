@@ -26,13 +26,28 @@ from vipe_core.slam.settings import SlamSettings
 from vipe_core.slam.timing import StageClock
 from vipe_core.slam.working import WorkingSize, working_size
 from vipe_core.slam.zoom import NO_ZOOM, Zoom
-from vipe_core.video.source import FrameSource
+from vipe_core.video.source import FrameSource, VideoInfo
 
 # How closely the later shots hold the focal length that the main one found: they share a camera.
 _SAME_FOCAL_SIGMA = 1e-4
 # How far from a calibration that is only a starting point the focal length may be: another copy of the lens, another
 # setting of its focus.
 _CALIBRATED_SIGMA = 0.02
+
+
+@dataclass(frozen=True, slots=True)
+class ViewOfRig:
+    """What a rig says of one of its views.
+
+    Attributes:
+        blind: The view shows nothing, or stands still while the others move: its poses are those of the rig alone.
+        rotation_sigma_deg: 1-sigma of its rotation in the rig, in the worst direction; 0 where that is not adjusted.
+        place_sigma: Of its place, in the units that the rig was given in.
+    """
+
+    blind: bool = False
+    rotation_sigma_deg: float = 0.0
+    place_sigma: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,6 +71,7 @@ class SlamResult:
         loops: What the loop edges of the main shot did.
         timings_s: Wall seconds per stage.
         zoom: Of the shot whose focal length changes most.
+        rig: Of a view of a rig, else None.
     """
 
     world_from_cam: NDArray[np.float64]
@@ -73,6 +89,7 @@ class SlamResult:
     loops: LoopReport
     timings_s: dict[str, float]
     zoom: Zoom = NO_ZOOM
+    rig: ViewOfRig | None = None
 
     @property
     def grid(self) -> Grid:
@@ -198,20 +215,22 @@ class Slam:
     def _initial_camera(
         self, source: FrameSource, selection: Selection, shot: Shot, size: WorkingSize
     ) -> IntrinsicsEstimate:
-        """The initial camera at the working size, with the source video's shape of pixels."""
+        """The initial camera at the working size."""
         sample = [frame for frame in selection.sample if shot.start <= frame.index < shot.stop]
-        estimate = self._priors.intrinsics.estimate(sample, size.grid)
-        # In units of a source pixel's height, that pixel is `aspect` wide.
-        aspect = source.info.pixel_aspect
-        scale_x, scale_y = size.width / (source.info.width * aspect), size.height / source.info.height
-        focal_px = estimate.camera.focal_px / math.sqrt(scale_x * scale_y)
-        width, height = source.info.width, source.info.height
-        shape = estimate.camera.params[4:]
-        own = (focal_px / aspect, focal_px, width / 2, height / 2, *shape)
-        camera = Camera(estimate.camera.model, own, width, height).resized(size.width, size.height)
-        scale = camera.focal_px / estimate.camera.focal_px
-        rivals_px = tuple(rival_px * scale for rival_px in estimate.rivals_px)
-        return IntrinsicsEstimate(camera, estimate.log_focal_sigma, estimate.num_pairs, rivals_px)
+        return with_pixels_of(source.info, self._priors.intrinsics.estimate(sample, size.grid), size)
+
+
+def with_pixels_of(info: VideoInfo, estimate: IntrinsicsEstimate, size: WorkingSize) -> IntrinsicsEstimate:
+    """The camera of square working pixels as that of a video, whose pixels have a shape of their own."""
+    # In units of a source pixel's height, that pixel is `aspect` wide.
+    aspect = info.pixel_aspect
+    scale_x, scale_y = size.width / (info.width * aspect), size.height / info.height
+    focal_px = estimate.camera.focal_px / math.sqrt(scale_x * scale_y)
+    own = (focal_px / aspect, focal_px, info.width / 2, info.height / 2, *estimate.camera.params[4:])
+    camera = Camera(estimate.camera.model, own, info.width, info.height).resized(size.width, size.height)
+    scale = camera.focal_px / estimate.camera.focal_px
+    rivals_px = tuple(rival_px * scale for rival_px in estimate.rivals_px)
+    return IntrinsicsEstimate(camera, estimate.log_focal_sigma, estimate.num_pairs, rivals_px)
 
 
 def _joined(maps: Sequence[ShotMap], cam_from_world: NDArray[np.float64]) -> NDArray[np.float64]:
