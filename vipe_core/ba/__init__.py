@@ -1,6 +1,6 @@
 """Dense bundle adjustment: the problem, its plan, and its solvers."""
 
-from vipe_core.ba.levenberg import newton_step, solve
+from vipe_core.ba.levenberg import newton_step, pose_covariance, solve
 from vipe_core.ba.problem import (
     Edges,
     Free,
@@ -33,6 +33,7 @@ __all__ = [
     "Step",
     "largest_residual_px",
     "newton_step",
+    "pose_covariance",
     "reproject",
     "residual_sigma_px",
     "residuals",

@@ -436,18 +436,26 @@ class HostSolver:
 
     def extrinsic_covariance(self, system: HostSystem, damping: float) -> Tensor:
         """See `Solver.extrinsic_covariance`."""
+        return self._covariance_of(self._view_place, system, damping)
+
+    def pose_covariance(self, system: HostSystem, damping: float, frame: int) -> Tensor:
+        """See `Solver.pose_covariance`."""
+        return self._covariance_of(self._pose_place[[frame]], system, damping)[0]
+
+    def _covariance_of(self, places: Array, system: HostSystem, damping: float) -> Tensor:
+        """(G, 6, 6) of the twists in G columns; 0 for -1, NaN where the system says nothing."""
         scale, factor, factorised = self._factorise(system, damping)
-        covariance = np.zeros((len(self._view_place), 6, 6))
-        for view in np.flatnonzero(self._view_place >= 0):
-            place = self._view_place[view]
+        covariance = np.zeros((len(places), 6, 6))
+        for number in np.flatnonzero(places >= 0):
+            place = places[number]
             if not factorised or not (scale[place] > 0).all():
-                covariance[view] = np.nan
+                covariance[number] = np.nan
                 continue
             for column in range(6):
                 unit = np.zeros_like(scale)
                 unit[place, column] = scale[place, column]
                 block_cholesky.substitute(self._structure.first, self._structure.rows, factor, unit)
-                covariance[view, :, column] = scale[place] * unit[place]
+                covariance[number, :, column] = scale[place] * unit[place]
         return torch.from_numpy(covariance)
 
 

@@ -9,6 +9,7 @@ that is at its minimum already costs one linearisation.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -105,7 +106,32 @@ def _intrinsics_covariances(solver: Solver[Any], descent: _Descent) -> tuple[Cov
 
 def _extrinsic_covariances(solver: Solver[Any], descent: _Descent) -> Tensor:
     """Of each camera of a rig, likewise."""
-    found = torch.stack([solver.extrinsic_covariance(descent.system(), damping) for damping in _SIGMA_DAMPINGS]).cpu()
+    return _sound([solver.extrinsic_covariance(descent.system(), damping) for damping in _SIGMA_DAMPINGS])
+
+
+def pose_covariance(problem: Problem, state: State, frame: int, options: Options | None = None) -> Tensor:
+    """How sure a pose is, with everything else that is free marginalised.
+
+    Args:
+        state: A solution of the problem.
+
+    Returns:
+        (6, 6) float64 on the host: the covariance of the left twist (translation, rotation) of the frame's
+        cam_from_world, or of the rig_from_world behind it; zero for a fixed pose, NaN where the problem says nothing.
+
+    Raises:
+        ConfigError, ValueError: As `solve`.
+    """
+    options = options or Options()
+    problem, state = _on_device(problem, state)
+    solver = _solver(problem, options, state)
+    system = solver.linearise(state, options.robust_scale_px)
+    return _sound([solver.pose_covariance(system, damping, frame)[None] for damping in _SIGMA_DAMPINGS])[0]
+
+
+def _sound(by_damping: Sequence[Tensor]) -> Tensor:
+    """(G, n, n) covariances, each by the least damping at which the system could be solved; NaN if by none."""
+    found = torch.stack(tuple(by_damping)).cpu()
     sound = (found.diagonal(dim1=-2, dim2=-1) >= 0).all(-1)
     first = sound.int().argmax(0)
     chosen = found[first, torch.arange(found.shape[1])]

@@ -106,3 +106,6 @@ class Solver(Protocol[System]):
 
     def extrinsic_covariance(self, system: System, damping: float) -> Tensor:
         """(V, 6, 6) covariance of the left twists of each camera of a rig, likewise."""
+
+    def pose_covariance(self, system: System, damping: float, frame: int) -> Tensor:
+        """(6, 6) covariance of the left twist of the pose of a frame, or of the rig pose behind it, likewise."""

@@ -489,8 +489,15 @@ class TorchSolver:
 
     def extrinsic_covariance(self, system: Linearisation, damping: float) -> Tensor:
         """See `Solver.extrinsic_covariance`."""
+        return self._covariance_of(self.plan.view_columns, system, damping)
+
+    def pose_covariance(self, system: Linearisation, damping: float, frame: int) -> Tensor:
+        """See `Solver.pose_covariance`."""
+        return self._covariance_of(self.plan.pose_columns[[frame]], system, damping)[0]
+
+    def _covariance_of(self, columns: Tensor, system: Linearisation, damping: float) -> Tensor:
+        """(G, 6, 6) of the twists in (G, 6) columns; 0 for what is held."""
         scale, factor, _, factorised = self._factorise(system, damping)
-        columns = self.plan.view_columns
         covariance = torch.zeros(len(columns), 6, 6, dtype=torch.float64, device=scale.device)
         # What is held has the number of a column that is none.
         moves = (columns < len(scale)).all(-1)

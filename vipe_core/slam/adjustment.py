@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from vipe_core.ba import robust_scale_px, solve
+from vipe_core.ba import pose_covariance, robust_scale_px, solve
 from vipe_core.ba.problem import Free, Grid, Options, Priors, Problem, Result, Rig, RobustKernel, State, Status
 from vipe_core.geometry.arrays import inverse
 from vipe_core.slam.graph import Graph
@@ -48,6 +48,7 @@ class Step:
         tolerance: The solve goes on while a step lowers the cost by at least this share.
         measured_scale: `scale` is the most; where the residuals are smaller, it is what makes the kernel efficient for
             them. What moves a pixel or two a frame is an outlier then, and does not bend the map.
+        initial_damping: Of the solver.
     """
 
     robust: RobustKernel
@@ -55,6 +56,7 @@ class Step:
     iterations: int
     tolerance: float = 1e-2
     measured_scale: bool = False
+    initial_damping: float = 1e-4
 
 
 FROM_SCRATCH = (
@@ -74,7 +76,9 @@ SETTLE = (Step("geman_mcclure", 1.0, 15, 1e-4, measured_scale=True),)
 """Everything is in its place but for the last digit."""
 
 
-_ARRIVE = Step("geman_mcclure", 1.0, 30, 1e-5, measured_scale=True)
+# The size of a rig, and its extrinsics, hang on little differences of much: what they still have to gain is a tiny
+# share of the cost, and damping stops them.
+_ARRIVE = Step("geman_mcclure", 1.0, 40, 1e-6, measured_scale=True, initial_damping=1e-7)
 
 
 @dataclass(frozen=True, slots=True)
@@ -158,6 +162,7 @@ class Adjuster:
         free_focal: bool = False,
         free_depth: bool = True,
         free_extrinsics: bool = False,
+        free_scale: bool = False,
     ) -> Result | None:
         """Adjust the keyframes `frames` with the edges among them; writes the result into `keyframes`.
 
@@ -166,6 +171,7 @@ class Adjuster:
             fixed_poses: Keyframes of `frames` whose poses hold the gauge; of a rig, one per instant is enough.
             edges: Use these edges only.
             free_extrinsics: Of a rig, adjust its extrinsics too; `frames` are all keyframes then.
+            free_scale: Of a rig, find the scale of the map anew: `frames` are all keyframes, and one pose is fixed.
 
         Returns:
             The last solve, or None when nothing could be solved and the map is as it was.
@@ -178,11 +184,11 @@ class Adjuster:
         )
         if free_extrinsics:
             problem = self._with_free_extrinsics(problem, keyframes)
-            # Extrinsics hang on little differences of much: they are the last to arrive.
-            schedule = (*schedule, _ARRIVE)
         result = self.anneal(problem, state, schedule)
         if result is None:
             return None
+        if free_scale or free_extrinsics:
+            result = self._arrive(keyframes, graph, frames, edges, problem, result)
         new_poses = result.state.cam_from_world.cpu().numpy()
         new_depths = result.state.inverse_depth.cpu().numpy()
         for row, k in enumerate(frames):
@@ -193,6 +199,67 @@ class Adjuster:
             keyframes.cam_from_rig = result.state.cam_from_rig.cpu().numpy()
             self._take_extrinsics(keyframes, result)
         return result
+
+    def _arrive(
+        self,
+        keyframes: KeyframeMap,
+        graph: Graph,
+        frames: Sequence[int],
+        edges: Sequence[tuple[int, int]],
+        problem: Problem,
+        result: Result,
+    ) -> Result:
+        """Go on without the depth prior until scale and extrinsics stand, then settle with the prior where they are.
+
+        The prior is around depths as they were. It is weak in every cell, but all cells together hold the scale of the
+        map where it was, against the little that tells how large the rig is.
+        """
+        bare = replace(problem, priors=replace(problem.priors, inverse_depth=None, inverse_depth_weight=None))
+        arrived = self.anneal(bare, result.state, (_ARRIVE,))
+        if arrived is None:
+            return result
+        before, after = result.state.inverse_depth, arrived.state.inverse_depth
+        # What is hardly measured goes astray meanwhile.
+        state = replace(arrived.state, inverse_depth=before * (after / before).median())
+        if problem.priors.inverse_depth is not None:
+            number = {k: row for row, k in enumerate(frames)}
+            depths = state.inverse_depth.cpu().numpy()
+            prior, weight = self._depth_prior(keyframes, graph, frames, edges, number, depths)
+            priors = replace(problem.priors, inverse_depth=prior, inverse_depth_weight=weight)
+            problem = replace(problem, priors=priors)
+        settled = self.anneal(problem, state, SETTLE) or arrived
+        # How sure the extrinsics are is asked where nothing holds the scale.
+        return replace(settled, extrinsic_covariances=arrived.extrinsic_covariances)
+
+    def scale_sigma(self, keyframes: KeyframeMap, graph: Graph) -> float:
+        """1-sigma of the logarithm of the scale that the size of a rig gives its map; infinite where it gives none.
+
+        That of the distance between the first instant and the one farthest from it, with everything else free.
+        """
+        views = keyframes.num_views
+        frames = range(len(keyframes))
+        edges = graph.among(frames)
+        if not keyframes.has_size or not edges:
+            return math.inf
+        poses = np.stack([keyframes.rig_pose(instant) for instant in range(len(keyframes) // views)])
+        centres = inverse(poses)[:, :3, 3]
+        far = int(np.argmax(np.linalg.norm(centres - centres[0], axis=1)))
+        reach = centres[far] - centres[0]
+        distance = float(np.linalg.norm(reach))
+        if not distance > 0:
+            return math.inf
+        problem, state = self._pose_problem(keyframes, graph, frames, (0,), edges, free_focal=True, free_depth=True)
+        problem = replace(problem, priors=replace(problem.priors, inverse_depth=None, inverse_depth_weight=None))
+        if self.extrinsic_prior is not None:
+            problem = self._with_free_extrinsics(problem, keyframes)
+        scale_px = robust_scale_px(problem, state, _ARRIVE.robust, (_LEAST_SCALE_PX, self.robust_scale_px))
+        options = Options(robust=_ARRIVE.robust, robust_scale_px=scale_px)
+        covariance = pose_covariance(problem, state, far * views, options).numpy()
+        towards = poses[far, :3, :3] @ (reach / distance)
+        variance = float(towards @ covariance[:3, :3] @ towards)
+        if not variance > 0:
+            return math.inf
+        return self.settings.focal_sigma_inflation * math.sqrt(variance) / distance
 
     def _take_extrinsics(self, keyframes: KeyframeMap, result: Result) -> None:
         """Note how sure the extrinsics are, and let the rig have the size in the map at which it is most like it was
@@ -319,6 +386,7 @@ class Adjuster:
                 robust=step.robust,
                 robust_scale_px=scale_px,
                 relative_tolerance=step.tolerance,
+                initial_damping=step.initial_damping,
             )
             solved = solve(problem, at, options)
             if solved.status is Status.EMPTY:

@@ -11,8 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vipe_core.ba.problem import Result
-from vipe_core.geometry.arrays import inverse
-from vipe_core.slam.adjustment import PROBED_SHARE, REFINE, SETTLE, Adjuster, Step
+from vipe_core.slam.adjustment import REFINE, SETTLE, Adjuster, Step
 from vipe_core.slam.centring import refine_principal_point
 from vipe_core.slam.closing import LoopCloser
 from vipe_core.slam.crossviews import CrossViews
@@ -34,10 +33,6 @@ _SUBSAMPLE = 4
 _READYING = 2
 # The principal point couples with rotation and position, so that one round of probes only comes near.
 _MAX_CENTRINGS = 3
-# Change of the logarithm of a rig's size in a probe, and how many instants are adjusted in one.
-_SIZE_STEP = 0.05
-_PROBED_INSTANTS = 24
-_SIZE_PROBE = (Step("geman_mcclure", 1.0, 12, 1e-4),)
 
 
 class Backend:
@@ -133,41 +128,6 @@ class Backend:
                 self._adjust()
         self._keyframes.normalise_scale()
 
-    def rig_scale_sigma(self) -> float:
-        """1-sigma of the logarithm of the scale that the size of a rig gives its map; infinite where it gives none.
-
-        The map is adjusted once more with the rig a little smaller and a little larger, while two of its poses, far
-        apart, hold the scale: what the cost says of the one size says it of the other.
-        """
-        keyframes, views = self._keyframes, self._keyframes.num_views
-        count = min(len(keyframes) // views, _PROBED_INSTANTS)
-        before = keyframes.snapshot()
-        if keyframes.cam_from_rig is None or before.cam_from_rig is None or count < 2:
-            return math.inf
-        rig_poses = [keyframes.rig_pose(instant) for instant in range(count)]
-        centres = inverse(np.stack(rig_poses))[:, :3, 3]
-        far = int(np.argmax(np.linalg.norm(centres - centres[0], axis=1)))
-        if far == 0:
-            return math.inf
-        costs, weight = [], 0.0
-        for change in (-_SIZE_STEP, 0.0, _SIZE_STEP):
-            keyframes.cam_from_rig = keyframes.cam_from_rig.copy()
-            keyframes.cam_from_rig[:, :3, 3] = before.cam_from_rig[:, :3, 3] * math.exp(change)
-            for instant, pose in enumerate(rig_poses):
-                keyframes.set_rig_pose(instant, pose)
-            result = self._adjuster.probe(
-                keyframes, self._measured.graph, range(count * views), (0, far * views), _SIZE_PROBE
-            )
-            keyframes.restore(before)
-            if result is None or not result.weight_sum > 0:
-                return math.inf
-            weight = result.weight_sum / PROBED_SHARE
-            costs.append(result.cost / result.weight_sum)
-        curvature = (costs[0] + costs[2] - 2 * costs[1]) / _SIZE_STEP**2
-        if not curvature > 0:
-            return math.inf
-        return self._settings.focal_sigma_inflation * math.sqrt(2 * costs[1] / (weight * curvature))
-
     def _connect_loops(self) -> None:
         count = len(self._keyframes)
         limit = max(1, round(self._settings.loop_edges_per_keyframe * count))
@@ -218,4 +178,5 @@ class Backend:
             schedule,
             free_focal=free_focal,
             free_extrinsics=self._adjuster.extrinsic_prior is not None,
+            free_scale=self._keyframes.has_size,
         )

@@ -66,6 +66,14 @@ class KeyframeMap:
     def num_views(self) -> int:
         return 1 if self.cam_from_rig is None else len(self.cam_from_rig)
 
+    @property
+    def has_size(self) -> bool:
+        """Whether it is of a rig whose cameras are apart, which tells the scale."""
+        if self.cam_from_rig is None:
+            return False
+        centres = inverse(self.cam_from_rig)[:, :3, 3]
+        return bool(np.ptp(centres, axis=0).max() > 0)
+
     def instant(self, k: int) -> int:
         """The number of the moment of a keyframe, without a rig its own."""
         return k // self.num_views

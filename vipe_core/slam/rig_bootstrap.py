@@ -106,7 +106,15 @@ class RigBootstrap:
 
     def _adjust(self, *, free_extrinsics: bool) -> None:
         everything = range(len(self._keyframes))
-        self._adjuster.adjust(self._keyframes, self._graph, everything, (0,), REFINE, free_extrinsics=free_extrinsics)
+        self._adjuster.adjust(
+            self._keyframes,
+            self._graph,
+            everything,
+            (0,),
+            REFINE,
+            free_extrinsics=free_extrinsics,
+            free_scale=self._keyframes.has_size,
+        )
 
     def _place_best(self, starts: Sequence[_ViewStart]) -> None:
         """Place all by the view and the scale that make the measurements of all views agree best."""

@@ -248,11 +248,8 @@ class RigSlam:
             backend.run()
             loops = examine_loops(reprojector, keyframes, graph, before, settings.neighbours)
             backend.sharpen()
-            # Where no views overlap, an error in the rotation of one looks like another length of its lever arm.
-            overlap = any(i != j and keyframes.instant(i) == keyframes.instant(j) for i, j in graph)
-            told = extent > 0 and not static and (overlap or not rig.refine)
-            sigma = backend.rig_scale_sigma() if told else math.inf
-            # Nor do more measurements average away what is wrong with the cameras, or with the places that they have.
+            sigma = math.inf if static else adjuster.scale_sigma(keyframes, graph)
+            # More measurements do not average away what is wrong with the cameras, or with the places that they have.
             places = 0.0 if extrinsics is None or extent <= 0 else float(extrinsics.place_sigma.max()) / extent
             sigma = math.hypot(sigma, settings.lens_sigma, places)
             adjuster.alive = _nothing
