@@ -91,7 +91,7 @@ def test_a_slip_in_a_view_is_named(change: dict[str, Any], says: str) -> None:
 
 
 def test_a_rig_of_one_camera_or_without_a_file_is_none(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match="view bent: .* not a rotation"):
+    with pytest.raises(ConfigError, match=r"view bent: .* not a rotation"):
         RigView("bent", 2 * np.eye(4))
     with pytest.raises(ConfigError, match="2 to"):
         Rig((RigView("alone", np.eye(4)),))

@@ -154,7 +154,8 @@ def joined(found: RigSlamResult, faces: CubeFaces, size: WorkingSize) -> SlamRes
         working=size,
         camera=camera,
         focal_sigma_ratio=0.0,
-        map=dataclasses.replace(front.map, confidence=confidence, residual_px=front.map.residual_px * px_per_face_px),
+        map=dataclasses.replace(found.map, confidence=confidence, residual_px=found.map.residual_px * px_per_face_px),
+        rig=None,
         loops=dataclasses.replace(
             front.loops,
             residual_before_px=front.loops.residual_before_px * px_per_face_px,

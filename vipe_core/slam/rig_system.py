@@ -89,6 +89,7 @@ class RigSlamResult:
 
     Attributes:
         views: The result of every view, all in one world: that of the first camera of view 0.
+        map: Diagnostics of all keyframes of all views.
         cam_from_rig: (V, 4, 4) float64 extrinsics in the units of the map, refined if that was asked for.
         rig_units: Length of the map's unit in that of the extrinsics as they were given.
         scale_sigma_ratio: 1-sigma of the logarithm of `rig_units`: how well the size of the rig tells the scale;
@@ -96,6 +97,7 @@ class RigSlamResult:
     """
 
     views: tuple[SlamResult, ...]
+    map: MapReport
     cam_from_rig: NDArray[np.float64]
     rig_units: float
     scale_sigma_ratio: float
@@ -150,6 +152,7 @@ class RigSlam:
         views = _views(done, trajectories, selection, size, clock.seconds)
         return RigSlamResult(
             tuple(_in_its_model(view, camera) for view, camera in zip(views, rig.cameras, strict=True)),
+            done.found,
             keyframes.cam_from_rig,
             keyframes.rig_units,
             sigma,
