@@ -22,7 +22,6 @@ from dataclasses import dataclass, replace
 from multiprocessing.synchronize import Barrier
 from pathlib import Path
 from queue import Queue
-from typing import Any
 
 import numpy as np
 import torch
@@ -30,10 +29,10 @@ from rich.console import Console
 from rich.table import Table
 
 from vipe_core.cameras import Camera
-from vipe_core.pipeline.device import resolve_device, set_threads
+from vipe_core.pipeline.device import device_memory_bytes, resolve_device, set_threads
+from vipe_core.pipeline.memory import USABLE_SHARE, plan_of
 from vipe_core.pipeline.presets import resolve
 from vipe_core.priors.droid import DroidMatcher, DroidNetwork
-from vipe_core.priors.droid.memory import plan_memory
 from vipe_core.slam.adjustment import Adjuster, FocalPrior
 from vipe_core.slam.frames import EncodedFrames
 from vipe_core.slam.graph import Graph
@@ -170,9 +169,7 @@ def _annotate(workload: Workload, network: DroidNetwork, frames: int | None = No
     """One video with the pieces that the engine is made of, and a schedule in the place of its decisions."""
     settings, device = workload.settings, network.device
     schedule = settings.refinement
-    clock = _SyncedClock(device)
-    if device.type == "cuda":
-        torch.cuda.reset_peak_memory_stats(device)
+    clock = StageClock(device)
     source = open_source(workload.video)
     matcher = DroidMatcher(network)
     info = source.info
@@ -215,32 +212,7 @@ def _annotate(workload: Workload, network: DroidNetwork, frames: int | None = No
                     if len(waiting) == settings.infill_batch or (waiting and index == count - 1):
                         poser.run(waiting)
                         waiting = []
-    peak_bytes = torch.cuda.max_memory_allocated(device) if device.type == "cuda" else 0
-    return Run(count, len(built), len(graph), clock.seconds, peak_bytes)
-
-
-class _SyncedClock(StageClock):
-    """Waits for the device at the end of each stage, so that its work counts where it was asked for."""
-
-    def __init__(self, device: torch.device) -> None:
-        super().__init__()
-        self._device = device
-
-    def __call__(self, stage: str) -> Any:
-        return _Synced(super().__call__(stage), self._device)
-
-
-class _Synced:
-    def __init__(self, stage: Any, device: torch.device) -> None:
-        self._stage, self._device = stage, device
-
-    def __enter__(self) -> None:
-        self._stage.__enter__()
-
-    def __exit__(self, *error: Any) -> Any:
-        if self._device.type == "cuda":
-            torch.cuda.synchronize(self._device)
-        return self._stage.__exit__(*error)
+    return Run(count, len(built), len(graph), clock.seconds, max(clock.peak_bytes.values(), default=0))
 
 
 def _clip(path: Path, frames: int, width: int, height: int) -> Path:
@@ -259,24 +231,15 @@ def _print_plan(
     console: Console, settings: SlamSettings, width: int, height: int, keyframes: int, device: torch.device
 ) -> None:
     grid = working_size(width, height, settings.working_area_px).grid
-    schedule = settings.refinement
+    preset = resolve("pose_only")
     for lean in (False, True):
-        plan = plan_memory(
-            grid,
-            keyframes=keyframes,
-            window_edges=schedule.window_edges,
-            edges_per_keyframe=schedule.global_edges,
-            most_edges=schedule.global_most_edges,
-            fill_frames=settings.infill_batch,
-            cache_bytes=settings.frame_cache_bytes,
-            lean=lean,
-        )
+        plan_bytes = plan_of(preset, grid, keyframes, lean=lean).total_bytes
         room = ""
-        if device.type == "cuda":
-            total_bytes = torch.cuda.get_device_properties(device).total_memory
-            room = f"; {plan.slots(total_bytes)} at once on this GPU"
-        profile = "without volumes" if lean else "with volumes"
-        console.print(f"planned {profile}: {plan.total_bytes / 1e9:.2f} GB a video, {keyframes} keyframes{room}")
+        total_bytes = device_memory_bytes(device)
+        if total_bytes is not None:
+            room = f"; {int(USABLE_SHARE * total_bytes) // plan_bytes} at once on this GPU"
+        profile = "in the low-memory profile" if lean else "with volumes"
+        console.print(f"planned {profile}: {plan_bytes / 1e9:.2f} GB a video, {keyframes} keyframes{room}")
 
 
 if __name__ == "__main__":

@@ -135,7 +135,16 @@ class Settings(BaseSettings):
     """Address of a Ray cluster to join; None starts a private Ray on this machine."""
 
     num_slots: int | None = Field(default=None, ge=1)
-    """Worker processes of the agent, one video in each; default: one per GPU, without GPUs one per core, 4 at most."""
+    """Worker processes of the agent, one video in each; default: what the GPUs have room for, without GPUs one per
+    core, 4 at most."""
+
+    slots_per_gpu: int | None = Field(default=None, ge=1, le=64)
+    """Worker processes that share a GPU, each with its part of the memory; default: planned from the memory of the
+    smallest GPU and what a usual video of `gpu_preset` takes, 8 at most."""
+
+    gpu_preset: str = "vipe_fast"
+    """Preset whose videos `slots_per_gpu` is planned for. Jobs of another preset run all the same: a video that does
+    not fit in the memory of its slot waits for that of others."""
 
     device: Literal["cpu", "cuda"] = "cpu"
     """Where the engine runs."""
@@ -203,6 +212,15 @@ class Settings(BaseSettings):
                 raise ValueError(f"{name!r} must be `tenant/name`: a secret belongs to one tenant")
             if len(secret.get_secret_value()) < 16:
                 raise ValueError(f"the secret {name!r} is shorter than 16 characters")
+        return value
+
+    @field_validator("gpu_preset")
+    @classmethod
+    def _preset(cls, value: str) -> str:
+        from vipe_core.pipeline.presets import PRESETS
+
+        if value not in PRESETS:
+            raise ValueError(f"unknown preset {value!r}; on offer: {', '.join(PRESETS)}")
         return value
 
     @field_validator("data_dir", "scratch_dir")

@@ -114,6 +114,8 @@ class Provenance:
 
     Attributes:
         scale_source: What the scale was taken from: `normalised`, `metric_depth`, or the user's known length as text.
+        memory_profile: `low` where the network's measurements were refined without volumes of correlation, as what the
+            video may take of the GPU asks; their last digits differ then. `full` elsewhere.
         calibration: The camera that the user gave, as `Calibration.to_json`, at the size of the pictures; with
             `resampled_to`, model, params, width and height of the camera that poses and depth were found in, where its
             distortion was taken out for that. None where the camera was estimated.
@@ -129,6 +131,7 @@ class Provenance:
     source: dict[str, object]
     scale_source: str = "normalised"
     calibration: dict[str, object] | None = None
+    memory_profile: str = "full"
 
 
 @dataclass(frozen=True, slots=True)
@@ -200,6 +203,7 @@ class Annotation:
         depth_kind: `z` along the optical axis, `ray` distance from the centre.
         mask_phrases: What the ids of the masks stand for: `MASK_PHRASES`, and a phrase for each thing that was found.
         timings_s: Wall seconds per stage. Filled further while `dense` is consumed; never part of the payload bytes.
+        peak_bytes: Most memory of the GPU that each stage took, in the same way; empty on a CPU.
         dense: Starts the dense stream: every frame in order, once per call, in bounded memory. Closing it ends its
             decoders.
     """
@@ -217,6 +221,7 @@ class Annotation:
     dense: Callable[[], Generator[DenseFrame, None, None]]
     timings_s: dict[str, float] = field(default_factory=dict)
     mask_phrases: Mapping[int, str] = field(default_factory=lambda: dict(MASK_PHRASES))
+    peak_bytes: dict[str, int] = field(default_factory=dict)
 
     @property
     def num_frames(self) -> int:

@@ -15,6 +15,7 @@
     ├── DecodeError           the decoder child is the cause
     │   ├── DecodeTimeout         decode_timeout      (retryable)
     │   └── DecodeCrashed         decode_crashed      (retryable)
+    ├── OutOfDeviceMemory     device_memory       the GPU has too little memory for the video (retryable)
     ├── ConfigError           invalid_config          a preset, camera or device that does not exist
     │   ├── LibraryMissing        library_missing     a preset needs a library that is not installed
     │   ├── WeightsMissing        weights_missing     a preset's network weights are not on this machine
@@ -128,6 +129,23 @@ class DecodeCrashed(DecodeError):
     """The decoder process died (a signal, or out of memory)."""
 
     code = "decode_crashed"
+
+
+class OutOfDeviceMemory(VipeError):
+    """The GPU has, or the video may take, too little memory for it; with more of it, or the low-memory profile, the
+    same video can succeed.
+
+    Attributes:
+        needed_bytes: What the video takes by plan, where that alone was refused; None where memory ran out in the work,
+            whose process had better end.
+    """
+
+    code = "device_memory"
+    retryable = True
+
+    def __init__(self, message: str, needed_bytes: int | None = None) -> None:
+        super().__init__(message)
+        self.needed_bytes = needed_bytes
 
 
 class ConfigError(VipeError):

@@ -25,6 +25,7 @@ from pathlib import Path
 import numpy as np
 
 from services.agent.engine import Engine, ProgressCallback, index_row, open_engine
+from services.agent.messages import Grant
 from services.domain.models import JobSpec, VideoRef, VideoResult
 from vipe_core.annotation import MEASURED, Annotation, DenseFrame, Provenance, Quality
 from vipe_core.cameras import Camera
@@ -51,7 +52,13 @@ class EngineWithAccidents:
         self._pace_s = float(os.environ[PACE_VARIABLE])
 
     def annotate(
-        self, path: Path, video: VideoRef, spec: JobSpec, root: Path, progress: ProgressCallback
+        self,
+        path: Path,
+        video: VideoRef,
+        spec: JobSpec,
+        root: Path,
+        progress: ProgressCallback,
+        grant: Grant | None = None,
     ) -> VideoResult:
         name = Path(video.uri).stem
         started = time.monotonic()
@@ -69,7 +76,7 @@ class EngineWithAccidents:
         if kind == "disk-full":
             _limit_file_size(_DISK_FULL_S)
         with _little_memory() if kind == "memory" else contextlib.nullcontext():
-            result = self._engine.annotate(path, video, spec, root, progress)
+            result = self._engine.annotate(path, video, spec, root, progress, grant)
         while time.monotonic() - started < self._pace_s:  # A job that lasts as long as the faults, on an idle machine.
             progress("depth", 0, None, 1.0)
             time.sleep(0.1)
@@ -108,7 +115,13 @@ class LightEngine:
         self._pace_s = pace_s
 
     def annotate(
-        self, path: Path, video: VideoRef, spec: JobSpec, root: Path, progress: ProgressCallback
+        self,
+        path: Path,
+        video: VideoRef,
+        spec: JobSpec,
+        root: Path,
+        progress: ProgressCallback,
+        grant: Grant | None = None,
     ) -> VideoResult:
         info = (source := open_source(path)).info
         stamps = []

@@ -226,7 +226,15 @@ class Agent:
     # The other threads ----------------------------------------------------------------------------------------------
 
     def _tend(self, number: int, handle: SlotHandle) -> None:
-        supervisor = Supervisor(handle, self._store, self._committer, self._give_backs, self._config, self._metrics)
+        supervisor = Supervisor(
+            handle,
+            self._store,
+            self._committer,
+            self._give_backs,
+            self._config,
+            self._metrics,
+            shares=self._executor.shares,
+        )
         backoff = self._new_backoff()
         while not self._stopping.is_set():
             try:

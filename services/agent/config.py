@@ -36,7 +36,8 @@ class AgentConfig:
             every node, each with its own contents.
         slots: Worker processes; one video in each. None: as many as the GPUs have room for, if `device` is `cuda`.
         device: Where the engine runs.
-        gpus_per_slot: Share of a GPU that a slot reserves when `device` is `cuda`.
+        slots_per_gpu: Slots that share a GPU when `device` is `cuda`; None: as its memory has room for.
+        gpu_preset: Preset whose videos that is planned for.
         cpus_per_slot: Cores that a slot reserves, and the threads its numeric libraries may use.
         ray_address: None starts a private Ray on this machine; otherwise the address of a cluster to join.
         lease_ttl_s: A lease that is not renewed for so long is given to somebody else; renewed every third of it.
@@ -72,7 +73,8 @@ class AgentConfig:
     scratch_dir: Path
     slots: int | None = 1
     device: Literal["cpu", "cuda"] = "cpu"
-    gpus_per_slot: float = 1.0
+    slots_per_gpu: int | None = None
+    gpu_preset: str = "vipe_fast"
     cpus_per_slot: int = 1
     ray_address: str | None = None
     lease_ttl_s: float = 60.0
@@ -110,8 +112,8 @@ class AgentConfig:
             raise ValueError(f"slots must be at least 1, got {self.slots}")
         if self.slots is None and self.device != "cuda":
             raise ValueError("slots must be given where there are no GPUs to count")
-        if not self.gpus_per_slot > 0:
-            raise ValueError(f"gpus_per_slot must be positive, got {self.gpus_per_slot}")
+        if self.slots_per_gpu is not None and self.slots_per_gpu < 1:
+            raise ValueError(f"slots_per_gpu must be at least 1, got {self.slots_per_gpu}")
         if self.lease_ttl_s <= 0:
             raise ValueError(f"lease_ttl_s must be positive, got {self.lease_ttl_s}")
         if not self.scratch_dir.is_absolute():
@@ -138,6 +140,8 @@ def config_from_settings(settings: Settings) -> AgentConfig:
         scratch_dir=settings.scratch_dir,
         slots=slots,
         device=settings.device,
+        slots_per_gpu=settings.slots_per_gpu,
+        gpu_preset=settings.gpu_preset,
         ray_address=settings.ray_address,
         lease_ttl_s=settings.lease_ttl_s,
         video_budget_base_s=settings.video_timeout_base_s,

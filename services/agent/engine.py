@@ -11,6 +11,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol, cast
 
+from services.agent.messages import Grant
 from services.domain.models import JobSpec, VideoRef, VideoResult
 from services.domain.states import VideoStatus
 from vipe_core.errors import ConfigError
@@ -35,9 +36,18 @@ _SHARES: dict[str, tuple[float, float]] = {
 
 class Engine(Protocol):
     def annotate(
-        self, path: Path, video: VideoRef, spec: JobSpec, root: Path, progress: ProgressCallback
+        self,
+        path: Path,
+        video: VideoRef,
+        spec: JobSpec,
+        root: Path,
+        progress: ProgressCallback,
+        grant: Grant | None = None,
     ) -> VideoResult:
         """Annotate the video at `path` and write its artifacts, named by `video.key`, below `root`.
+
+        Args:
+            grant: What it may take of the GPU; None where there is none.
 
         Returns:
             The index row of a success, with `attempt` 0; the caller sets it.
@@ -61,7 +71,13 @@ class VipeEngine:
         self._annotator = annotator
 
     def annotate(
-        self, path: Path, video: VideoRef, spec: JobSpec, root: Path, progress: ProgressCallback
+        self,
+        path: Path,
+        video: VideoRef,
+        spec: JobSpec,
+        root: Path,
+        progress: ProgressCallback,
+        grant: Grant | None = None,
     ) -> VideoResult:
         from vipe_core.cameras.calibration import Calibration
         from vipe_core.formats.artifacts import ALL_ATTRIBUTES, write_artifacts
@@ -82,12 +98,21 @@ class VipeEngine:
             report(at.stage, at.frames_done, at.frames_total)
 
         known = None if spec.calibration is None else Calibration.from_json(spec.calibration)
-        annotation = self._annotator.annotate(
-            path, name=video.key, scale_from=spec.scale_from, calibration=known, progress=during
-        )
-        write_artifacts(
-            annotation, root, attributes=attributes, progress=lambda done, all_: report("depth", done, all_)
-        )
+        try:
+            annotation = self._annotator.annotate(
+                path,
+                name=video.key,
+                scale_from=spec.scale_from,
+                calibration=known,
+                memory_bytes=None if grant is None else grant.memory_bytes,
+                low_memory=grant is not None and grant.low_memory,
+                progress=during,
+            )
+            write_artifacts(
+                annotation, root, attributes=attributes, progress=lambda done, all_: report("depth", done, all_)
+            )
+        finally:
+            self._annotator.release()
         return index_row(annotation, video)
 
 
@@ -123,6 +148,7 @@ def index_row(annotation: Annotation, video: VideoRef) -> VideoResult:
         depth_kind=annotation.depth_kind,
         quality=annotation.quality.summary(),
         timings_s={stage: round(seconds, 4) for stage, seconds in annotation.timings_s.items()},
+        peak_bytes=dict(annotation.peak_bytes) or None,
         source=provenance.pop("source"),
         provenance=provenance,
     )

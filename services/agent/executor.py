@@ -9,6 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Protocol
 
+from services.agent.gpus import GpuShares
 from services.agent.messages import Reply, SlotProgress, Task
 
 
@@ -53,6 +54,10 @@ class SlotHandle(Protocol):
 
 class Executor(Protocol):
     """Owns the processes of an agent. All methods from one thread, which must live as long as the executor."""
+
+    @property
+    def shares(self) -> GpuShares | None:
+        """How the slots share GPUs, once it has started; None where there are none."""
 
     def start(self) -> None:
         """Start or join the machinery."""

@@ -15,9 +15,29 @@ FailureScope = Literal["video", "storage", "shard", "job"]
 
 
 @dataclass(frozen=True, slots=True)
+class Grant:
+    """What a video may take of a GPU that others share.
+
+    Attributes:
+        memory_bytes: At most.
+        low_memory: The low-memory profile, whatever would fit.
+    """
+
+    memory_bytes: int
+    low_memory: bool = False
+
+
+@dataclass(frozen=True, slots=True)
 class AnnotateVideo:
+    """Annotate one video.
+
+    Attributes:
+        grant: None where there is no GPU.
+    """
+
     lease: Lease
     video: VideoRef
+    grant: Grant | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,6 +99,7 @@ class Failed:
     Attributes:
         message: One line for the user.
         detail: Traceback of an error that nobody foresaw, for the log.
+        needed_bytes: Of a GPU too small for the video: what it takes by plan; None where memory ran out in the work.
     """
 
     code: str
@@ -86,6 +107,7 @@ class Failed:
     retryable: bool
     scope: FailureScope = "video"
     detail: str | None = None
+    needed_bytes: int | None = None
 
 
 @dataclass(frozen=True, slots=True)

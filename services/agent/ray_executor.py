@@ -22,12 +22,13 @@ import socket
 import tempfile
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 from services.agent.config import AgentConfig
 from services.agent.executor import Died, SlotHandle
+from services.agent.gpus import GpuShares, SlotPlan, gpu_memory_bytes, plan_slots
 from services.agent.messages import Failed, Reply, SlotProgress, Task
 from services.agent.ray_health import RayGate, RayGone, all_alive, answers, head_processes
 from services.agent.slot import Slot, SlotConfig
@@ -45,6 +46,8 @@ _NAMESPACE = "vipe"
 _STEP_S = 0.5  # No call into Ray takes longer, so that Ray can be replaced.
 _LEAVE_TIMEOUT_S = 30.0
 _CLUSTER_PATIENCE_S = 10.0
+_ASKING_TIMEOUT_S = 120.0
+_ASKING_GPUS = 0.01
 _GONE = Died("Ray's head is gone", preempted=True)
 _THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
 
@@ -258,10 +261,14 @@ class RayExecutor:
         self._config = config
         self._private = config.ray_address is None
         # Asked here and not in `start`, which is tried again and again: too many slots will not fit later either.
-        self._num_slots = slots_on_this_machine(config) if self._private else config.slots
+        self._plan: SlotPlan | None = None
+        self._num_slots = config.slots
+        if self._private and config.device == "cuda":
+            self._plan_gpus(gpu_memory_bytes(), os.cpu_count())
         self._temp_dir: Path | None = None
         self._head: dict[int, str] = {}
         self._address = ""
+        self._shares: GpuShares | None = None if self._plan is None else GpuShares(self._plan)
         self.gate = RayGate()
         self.actor_class: Any = None
         self._slots: list[RaySlot] = []
@@ -276,6 +283,10 @@ class RayExecutor:
         self._slots = [
             RaySlot(number, self, self._config, private=self._private) for number in range(self._num_slots or 1)
         ]
+
+    @property
+    def shares(self) -> GpuShares | None:
+        return self._shares
 
     def restart(self) -> None:
         """Leave a Ray that does not answer and start or join again. Raises what `start` raises."""
@@ -323,8 +334,8 @@ class RayExecutor:
                 log_to_driver=False,
                 configure_logging=False,
             )
-            if self._num_slots is None:
-                self._num_slots = self._slots_on_the_cluster()
+            if self._config.device == "cuda" and self._plan is None:
+                self._shares = GpuShares(self._plan_gpus(self._gpus_of_the_cluster()))
         import ray
 
         self._head = head_processes() if self._private else {}
@@ -345,19 +356,69 @@ class RayExecutor:
         if self._temp_dir is not None:
             shutil.rmtree(self._temp_dir, ignore_errors=True)
 
-    def _slots_on_the_cluster(self) -> int:
-        """As many slots as its GPUs have room for now.
+    def _plan_gpus(self, memory_bytes: Sequence[int], cores: int | None = None) -> SlotPlan:
+        """Decide how slots share GPUs, and how many there are where nobody says.
 
         Raises:
-            ConnectionError: No GPU has joined it yet.
+            ConfigError: There is no GPU, or not enough of it.
+        """
+        from vipe_core.pipeline.memory import idle_bytes, usual_bytes  # Slow to import, and of no use without GPUs.
+        from vipe_core.pipeline.presets import resolve
+
+        config, preset = self._config, resolve(self._config.gpu_preset)
+        if not memory_bytes:
+            raise ConfigError("there is no GPU for device 'cuda'; use device 'cpu', or check the driver")
+        usual = usual_bytes(preset)
+        plan = plan_slots(
+            memory_bytes,
+            usual_bytes=usual,
+            idle_bytes=idle_bytes(preset),
+            cores=None if cores is None else cores // config.cpus_per_slot,
+            # Of a cluster, some GPUs may be yet to come.
+            slots=config.slots if self._private else None,
+            per_gpu=config.slots_per_gpu,
+        )
+        if self._num_slots is None:
+            self._num_slots = plan.per_gpu * len(memory_bytes)
+        logger.info(
+            "%d slots on %d GPUs, %d on each with %.1f GB; a usual video of preset %s takes %.1f GB by plan",
+            self._num_slots,
+            len(memory_bytes),
+            plan.per_gpu,
+            plan.bytes_of(1) / 1e9,
+            preset.name,
+            usual / 1e9,
+        )
+        self._plan = plan
+        return plan
+
+    def _gpus_of_the_cluster(self) -> list[int]:
+        """The memory of each GPU of the cluster, asked on its nodes: those of one node are alike.
+
+        Raises:
+            ConnectionError: No GPU has joined it yet, or a node does not answer.
         """
         import ray
+        from ray.exceptions import RayError
+        from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
-        gpus = float(ray.cluster_resources().get("GPU", 0))
-        number = math.floor(gpus / self._config.gpus_per_slot + 1e-6)
-        if number < 1:
-            raise ConnectionError("the Ray cluster has no GPU yet; wait for its nodes, or set the number of slots")
-        return number
+        nodes = [node for node in ray.nodes() if node["Alive"] and node["Resources"].get("GPU", 0) >= 1]
+        if not nodes:
+            raise ConnectionError("the Ray cluster has no GPU yet; wait for its nodes")
+        ask = ray.remote(num_cpus=0, num_gpus=_ASKING_GPUS, max_retries=0)(gpu_memory_bytes)
+        asked = [
+            ask.options(scheduling_strategy=NodeAffinitySchedulingStrategy(node["NodeID"], soft=False)).remote()
+            for node in nodes
+        ]
+        try:
+            answers: list[tuple[int, ...]] = ray.get(asked, timeout=_ASKING_TIMEOUT_S)
+        except (RayError, TimeoutError) as error:
+            raise ConnectionError(f"a GPU node of the Ray cluster does not say what it has: {error}") from error
+        if not all(answers):
+            raise ConnectionError("a node of the Ray cluster offers GPUs that CUDA does not find; check its driver")
+        return [
+            found[0] for node, found in zip(nodes, answers, strict=True) for _ in range(int(node["Resources"]["GPU"]))
+        ]
 
     def _start_private(self) -> None:
         config = self._config
@@ -370,7 +431,7 @@ class RayExecutor:
 
         self._temp_dir = private_temp_dir(config.scratch_dir.parent)
         slots = self._num_slots or 1
-        gpus = math.ceil(slots * config.gpus_per_slot) if config.device == "cuda" else 0
+        gpus = 0 if self._plan is None else math.ceil(slots / self._plan.per_gpu)
         logging.getLogger("ray").setLevel(logging.ERROR)  # It warns about every thread that is not the main one.
         with _environment(self._worker_environment()):  # Workers inherit it, which is faster than a runtime_env.
             ray.init(
@@ -398,39 +459,12 @@ class RayExecutor:
             ray.method(concurrency_group="control")(beside_the_task)  # Marks the function.
         return ray.remote(
             num_cpus=config.cpus_per_slot,
-            num_gpus=config.gpus_per_slot if config.device == "cuda" else 0,
+            num_gpus=0 if self._plan is None else self._plan.gpus_per_slot,
             max_restarts=0,
             max_task_retries=0,
             concurrency_groups={"control": 2},
             runtime_env=None if self._private else {"env_vars": self._worker_environment()},
         )(SlotActor)
-
-
-def slots_on_this_machine(config: AgentConfig) -> int:
-    """The number of slots, that of the GPUs' shares if none is given.
-
-    Raises:
-        ConfigError: There is no GPU, or there are fewer than the slots need.
-    """
-    if config.device != "cuda":
-        return config.slots or 1
-    gpus = count_gpus()
-    room = math.floor(gpus / config.gpus_per_slot + 1e-6)
-    if room < 1:
-        raise ConfigError("there is no GPU for device 'cuda'; use device 'cpu', or check the driver")
-    if config.slots is not None and config.slots > room:
-        raise ConfigError(
-            f"{config.slots} slots need {config.slots * config.gpus_per_slot:g} GPUs, this machine has {gpus}; "
-            f"set the number of slots to {room} at most"
-        )
-    return config.slots or room
-
-
-def count_gpus() -> int:
-    """The CUDA devices that this process may use."""
-    import torch  # Slow to import, and of no use to a process without GPUs.
-
-    return torch.cuda.device_count()
 
 
 @contextlib.contextmanager

@@ -42,7 +42,7 @@ from services.domain.states import VideoStatus
 from services.inputs.fetching import Fetched, fetched
 from services.inputs.rules import InputRules
 from services.storage import open_store
-from vipe_core.errors import EngineError, VipeError
+from vipe_core.errors import EngineError, OutOfDeviceMemory, VipeError
 from vipe_core.video.limits import Limits, use_limits
 
 logger = logging.getLogger(__name__)
@@ -159,7 +159,10 @@ class Slot:
         root = scratch.staging()
         failure: Failed
         try:
-            result = engine.annotate(path, video, lease.spec, root, self._report)
+            result = engine.annotate(path, video, lease.spec, root, self._report, task.grant)
+        except OutOfDeviceMemory as error:
+            message = _one_line(error, path, video)
+            failure = Failed(error.code, message, error.retryable, needed_bytes=error.needed_bytes)
         except VipeError as error:
             failure = Failed(error.code, _one_line(error, path, video), retryable=error.retryable)
         except MemoryError as error:
@@ -200,6 +203,8 @@ class Slot:
         if engine is None:
             try:
                 engine = load_opener(self._config.engine)(spec.preset, spec.camera, self._config.device, **changed)
+            except OutOfDeviceMemory:
+                raise  # With more of the GPU, or another one, it can be opened.
             except VipeError as error:
                 raise _JobFailure(error) from error
             self._engines = {key: engine}  # One at a time: another preset's weights would stay in memory.

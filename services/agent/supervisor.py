@@ -25,6 +25,7 @@ from services.agent.backoff import Backoff, GiveBacks, exponential_s
 from services.agent.commits import Committer
 from services.agent.config import AgentConfig
 from services.agent.executor import Died, SlotHandle
+from services.agent.gpus import GpuShares, Want
 from services.agent.leases import LiveLease, StopReason
 from services.agent.messages import (
     Annotated,
@@ -33,6 +34,7 @@ from services.agent.messages import (
     Cancelled,
     DiscardShard,
     Failed,
+    Grant,
     Opened,
     OpenShard,
     Packed,
@@ -47,6 +49,7 @@ from services.domain.states import VideoStatus
 from services.observability.logging import context
 from services.observability.metrics import Metrics
 from services.store.base import Store
+from vipe_core.errors import OutOfDeviceMemory
 
 logger = logging.getLogger(__name__)
 
@@ -95,6 +98,7 @@ class Supervisor:
     Args:
         clock: Monotonic seconds.
         sleep: Waits; both are seams for tests.
+        shares: Of the GPUs that slots share; None without GPUs.
     """
 
     def __init__(
@@ -107,6 +111,7 @@ class Supervisor:
         metrics: Metrics,
         clock: Callable[[], float] = time.monotonic,
         sleep: Callable[[float], None] = time.sleep,
+        shares: GpuShares | None = None,
     ) -> None:
         self._handle = handle
         self._store = store
@@ -117,6 +122,7 @@ class Supervisor:
         self._traffic = TrafficMetrics(metrics)
         self._clock = clock
         self._sleep = sleep
+        self._shares = shares
         self._alive = False
         self._suspicious: list[str] = []
         self._proved = False
@@ -209,6 +215,7 @@ class Supervisor:
         lease = live.lease
         tries: dict[str, int] = {}
         timeouts: dict[str, int] = {}
+        wants: dict[str, Want] = {}
         storage = self._backoff()
         while missing := [video for video in lease.videos if video.key not in results]:
             # Those that have killed a worker go last: the others are safe by then, and the slot has proved itself.
@@ -222,12 +229,27 @@ class Supervisor:
                 self._replace(results, self._opened(live, results))
             live.follow(tuple(results.values()), self._handle.progress)
             with context(video=video.key):
-                answer = self._run(live, AnnotateVideo(lease, video), partial(self._budget_s, video))
+                answer = self._annotate(live, video, wants.get(video.key, Want()))
                 match answer:
                     case Annotated(result):
                         results[video.key] = result
                         self._trust()
                         storage.succeeded()
+                    case Failed(code=OutOfDeviceMemory.code) if self._shares is not None:
+                        self._trust()
+                        wider = self._shares.plan.wider(wants.get(video.key, Want()), answer.needed_bytes)
+                        if answer.needed_bytes is None:
+                            # What failed half-way may hold memory for good.
+                            self._metrics.actor_restarts.labels(reason=OutOfDeviceMemory.code).inc()
+                            self.stop()
+                            self._replace(results, self._opened(live, results))
+                        if wider is None:
+                            whole_gb = self._shares.plan.bytes_of(self._shares.plan.per_gpu) / 1e9
+                            message = f"{answer.message}; a whole GPU here has {whole_gb:.1f} GB for one video"
+                            results[video.key] = failed_row(video, lease.attempt, answer.code, message)
+                        else:
+                            logger.warning("%s; another try with %s", answer.message, wider)
+                            wants[video.key] = wider
                     case Failed(scope="video"):
                         self._trust()
                         tries[video.key] = tries.get(video.key, 0) + 1
@@ -261,6 +283,16 @@ class Supervisor:
                         self._replace(results, self._opened(live, results))
                     case _:
                         raise TypeError(f"unexpected answer {type(answer).__name__} to an annotate task")
+
+    def _annotate(self, live: LiveLease, video: VideoRef, want: Want) -> Answer | Died | _TimedOut:
+        """Annotate a video, on a GPU with what it is given of its memory, which may have to be waited for."""
+        budget_s = partial(self._budget_s, video)
+        if self._shares is None:
+            return self._run(live, AnnotateVideo(live.lease, video), budget_s)
+        self._restart(live)  # Only a process has a GPU.
+        grant = Grant(self._shares.plan.bytes_of(want.shares), want.low_memory)
+        with self._shares.held(self._handle.place, want.shares, partial(_go_on, live)):
+            return self._run(live, AnnotateVideo(live.lease, video, grant), budget_s)
 
     def _opened(self, live: LiveLease, known: dict[str, VideoResult]) -> dict[str, VideoResult]:
         """Open the shard on a live process: what is finished on its node, and rows that need no artifacts."""
@@ -501,8 +533,7 @@ class Supervisor:
         """Wait, but not longer than the lease may be worked on."""
         until = self._clock() + seconds
         while (left := until - self._clock()) > 0:
-            if live.stop_reason is not None:
-                raise _Ended(ShardOutcome("stopped", live.stop_reason))
+            _go_on(live)
             self._sleep(min(_POLL_S, left))
 
     def _backoff(self) -> Backoff:
@@ -512,3 +543,8 @@ class Supervisor:
     def _replace(results: dict[str, VideoResult], fresh: dict[str, VideoResult]) -> None:
         results.clear()
         results.update(fresh)
+
+
+def _go_on(live: LiveLease) -> None:
+    if live.stop_reason is not None:
+        raise _Ended(ShardOutcome("stopped", live.stop_reason))

@@ -228,7 +228,10 @@ class VideoView(_View):
     depth_kind: str | None = None
     quality: dict[str, Any] | None = None
     seconds: float | None = None
-    timings_s: dict[str, float] | None = None
+    timings_s: dict[str, float] | None = Field(default=None, description="Wall seconds per stage.")
+    peak_bytes: dict[str, int] | None = Field(
+        default=None, description="Most memory of the GPU per stage; null without one."
+    )
     source: dict[str, Any] | None = None
     provenance: dict[str, Any] | None = None
 

@@ -12,7 +12,6 @@ import typer
 
 if TYPE_CHECKING:
     from vipe_core.annotation import Annotation
-    from vipe_core.cameras.calibration import Calibration
     from vipe_core.pipeline.annotator import Annotator
 
 
@@ -33,7 +32,7 @@ def annotate(
         str,
         typer.Option(
             help="classical; classical_fast: coarser dense depth; wide_angle: a bent lens; panorama: 360 degrees; "
-            "vipe_fast, pose_only: by the DROID network (vipectl models)."
+            "vipe_fast, pose_only: by the DROID network; vipe: all of the paper's networks (vipectl models)."
         ),
     ] = "classical",
     camera: Annotated[
@@ -83,6 +82,10 @@ def annotate(
             "nerfstudio's transforms.json. What it says of `use` decides: fixed, or initial for a starting point.",
         ),
     ] = None,
+    low_memory: Annotated[
+        bool,
+        typer.Option("--low-memory", help="On a GPU: slower, in less of its memory; what does not fit does so itself."),
+    ] = False,
     as_json: Annotated[bool, typer.Option("--json", help="One JSON line per input on stdout, nothing else.")] = False,
 ) -> None:
     """Annotate videos on this machine, without the service.
@@ -132,7 +135,7 @@ def annotate(
         if as_json:
             for row in views:
                 _print_json(row)
-        _show(views, output, as_json=as_json)
+        _show(views, output, as_json=as_json, stages=False)
         return
     annotator = Annotator(preset=preset, camera=camera, device=device, options=options)
     names = SequenceNames(output)
@@ -140,7 +143,8 @@ def annotate(
     for path in paths:
         started = time.perf_counter()
         try:
-            row = _annotate_one(annotator, path, output, names.name_for(path), masks, scale_from, known, console)
+            how = {"masks": masks, "scale_from": scale_from, "calibration": known, "low_memory": low_memory}
+            row = _annotate_one(annotator, path, output, names.name_for(path), how, console)
             row["seconds"] = round(time.perf_counter() - started, 3)
             row["frames_per_s"] = round(row["num_frames"] / row["seconds"], 3)
         except VipeError as error:
@@ -157,13 +161,15 @@ def _print_json(row: dict[str, Any]) -> None:
     sys.stdout.flush()
 
 
-def _show(rows: list[dict[str, Any]], output: Path, *, as_json: bool) -> None:
-    """A table of what was done; exit code 1 if anything failed."""
+def _show(rows: list[dict[str, Any]], output: Path, *, as_json: bool, stages: bool = True) -> None:
+    """Tables of what was done, and of what took how long unless rows share it; exit code 1 if anything failed."""
     done = [row for row in rows if "error" not in row]
     if done and not as_json:
-        from services.cli.tables import annotation_table, results_console
+        from services.cli.tables import annotation_table, results_console, stage_table
 
         results_console().print(annotation_table(done))
+        if stages:
+            results_console().print(stage_table(done))
         results_console().print(f"Written to {output.resolve()}", soft_wrap=True)
     if len(done) < len(rows):
         raise typer.Exit(1)
@@ -174,11 +180,10 @@ def _annotate_one(
     path: Path,
     output: Path,
     name: str,
-    masks: Path | None,
-    scale_from: str | None,
-    calibration: Calibration | None,
+    how: dict[str, Any],
     console: Any,
 ) -> dict[str, Any]:
+    """The row of one input; `how` are arguments of `Annotator.annotate`."""
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
     from vipe_core.annotation import Progress as EngineProgress
@@ -197,9 +202,7 @@ def _annotate_one(
         def report(progress: EngineProgress) -> None:
             bars.update(task, description=progress.stage, completed=progress.frames_done, total=progress.frames_total)
 
-        annotation = annotator.annotate(
-            path, name=name, masks=masks, scale_from=scale_from, calibration=calibration, progress=report
-        )
+        annotation = annotator.annotate(path, name=name, progress=report, **how)
 
         def written(done: int, total: int) -> None:
             bars.update(task, description="depth", completed=done, total=total)
@@ -225,4 +228,5 @@ def annotation_row(path: Path, annotation: Annotation, output: Path) -> dict[str
         "scale_source": annotation.provenance.scale_source,
         "quality": annotation.quality.summary(),
         "timings_s": {stage: round(seconds, 3) for stage, seconds in annotation.timings_s.items()},
+        "peak_bytes": dict(annotation.peak_bytes),
     }

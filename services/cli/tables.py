@@ -71,3 +71,23 @@ def annotation_table(
             cells += ["-", "-"] if score is None else [f"{score['ate_pct']:.2f}%", f"{score['fov_err_deg']:.2f}°"]
         table.add_row(*cells, _quality(row.get("quality")))
     return table
+
+
+def stage_table(rows: Iterable[Mapping[str, Any]]) -> Table:
+    """Where the time went, over all rows of `vipectl annotate`: stages in the order in which they run."""
+    seconds: dict[str, float] = {}
+    peak_bytes: dict[str, int] = {}
+    for row in rows:
+        for stage, spent_s in row["timings_s"].items():
+            seconds[stage] = seconds.get(stage, 0.0) + spent_s
+        for stage, peak in row["peak_bytes"].items():
+            peak_bytes[stage] = max(peak_bytes.get(stage, 0), peak)
+    table = Table(show_edge=False, pad_edge=False, header_style="bold")
+    table.add_column("stage")
+    for title in ("seconds", "share", *(["GPU memory"] if peak_bytes else [])):
+        table.add_column(title, justify="right", no_wrap=True)
+    total_s = sum(seconds.values()) or 1.0
+    for stage, spent_s in seconds.items():
+        peak = [f"{peak_bytes.get(stage, 0) / 1e9:.2f} GB"] if peak_bytes else []
+        table.add_row(stage, f"{spent_s:.2f}", f"{100 * spent_s / total_s:.0f}%", *peak)
+    return table

@@ -288,6 +288,7 @@ class VideoResult:
         camera_params: Source-resolution parameters, half-pixel convention.
         quality: `Quality.summary()` of the engine.
         timings_s: Seconds per stage.
+        peak_bytes: Most memory of the GPU per stage; None without one.
         source: What the probe found (codec, pixel format, rotation, size).
         deaths: The worker processes that died on it, where it is quarantined for them.
     """
@@ -316,6 +317,7 @@ class VideoResult:
     source: dict[str, Any] | None = None
     provenance: dict[str, Any] | None = None
     deaths: tuple[Death, ...] | None = None
+    peak_bytes: dict[str, int] | None = None
 
     def to_json(self) -> dict[str, Any]:
         return asdict(self)

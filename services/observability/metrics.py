@@ -29,6 +29,7 @@ from services.domain.errors import InputUnavailable
 from services.domain.models import VideoResult
 from services.domain.states import JobState, ShardState, VideoStatus
 from vipe_core import errors as engine_errors
+from vipe_core.errors import OutOfDeviceMemory
 
 if TYPE_CHECKING:
     from threading import Thread
@@ -38,6 +39,7 @@ CONTENT_TYPE = CONTENT_TYPE_LATEST
 """The media type of `Metrics.render()`."""
 
 _STAGE_BUCKETS_S = (0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0, 20.0, 40.0, 80.0, 160.0, 320.0, 640.0, 1280.0)
+_MEMORY_BUCKETS_BYTES = tuple(float(1 << exponent) for exponent in range(28, 38))
 _REQUEST_BUCKETS_S = (0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0)
 
 WORKER_DIED = "worker_died"
@@ -123,6 +125,14 @@ class Metrics:
             registry=registry,
         )
 
+        self.stage_gpu_peak = Histogram(
+            "vipe_stage_gpu_peak_bytes",
+            "Most memory of the GPU that a stage of a video took; nothing without a GPU.",
+            ["stage"],
+            buckets=_MEMORY_BUCKETS_BYTES,
+            registry=registry,
+        )
+
         # Leases and commits.
         self.lease_expired = Counter(
             "vipe_lease_expired_total", "Leases that ran out and were requeued.", registry=registry
@@ -143,7 +153,8 @@ class Metrics:
         # Actors.
         self.actor_restarts = Counter(
             "vipe_actor_restarts_total",
-            "Worker processes that had to be replaced, by reason: died, video_timeout, start_failed, recycled.",
+            "Worker processes that had to be replaced, by reason: died, video_timeout, start_failed, recycled, "
+            "device_memory.",
             ["reason"],
             registry=registry,
         )
@@ -199,7 +210,7 @@ class Metrics:
         self.videos.labels(outcome=VideoStatus.QUARANTINED.value, error_class=WORKER_DIED)
         for code in FAILURE_CODES:
             self.videos.labels(outcome=VideoStatus.FAILED.value, error_class=code)
-        for reason in ("died", "video_timeout", "start_failed", "recycled"):
+        for reason in ("died", "video_timeout", "start_failed", "recycled", OutOfDeviceMemory.code):
             self.actor_restarts.labels(reason=reason)
         for result in ("delivered", "failed", "abandoned"):
             self.webhook_deliveries.labels(result=result)
@@ -241,6 +252,8 @@ class Metrics:
             self.frames.inc(result.num_frames)
         for stage, seconds in (result.timings_s or {}).items():
             self.stage_duration.labels(stage=stage).observe(seconds)
+        for stage, peak_bytes in (result.peak_bytes or {}).items():
+            self.stage_gpu_peak.labels(stage=stage).observe(peak_bytes)
 
     def render(self) -> bytes:
         """The Prometheus text page, of type `CONTENT_TYPE`."""

@@ -12,6 +12,9 @@
     flaky=PATH           a retryable typed error, once
     leak=MIB             keeps so much memory for ever
     count=PATH           appends a line to PATH before anything else
+    needs=GB/GB          runs out of GPU memory where it is granted less, in the full and in the low-memory profile
+    planned=GB           refuses to begin where it is granted less
+    gpu-log=PATH         appends what it is granted of a GPU
 
 They write real artifacts with the engine's own writer, so that everything behind them is the real thing.
 """
@@ -29,10 +32,11 @@ from pathlib import Path
 import numpy as np
 
 from services.agent.engine import ProgressCallback, index_row
+from services.agent.messages import Grant
 from services.domain.models import JobSpec, VideoRef, VideoResult
 from vipe_core.annotation import MEASURED, Annotation, DenseFrame, Provenance, Quality
 from vipe_core.cameras import Camera
-from vipe_core.errors import ConfigError, CorruptMedia, DecodeCrashed
+from vipe_core.errors import ConfigError, CorruptMedia, DecodeCrashed, OutOfDeviceMemory
 from vipe_core.formats import write_artifacts
 
 WIDTH, HEIGHT = 16, 12
@@ -52,7 +56,13 @@ class ScriptedEngine:
         self._real_process = real_process
 
     def annotate(
-        self, path: Path, video: VideoRef, spec: JobSpec, root: Path, progress: ProgressCallback
+        self,
+        path: Path,
+        video: VideoRef,
+        spec: JobSpec,
+        root: Path,
+        progress: ProgressCallback,
+        grant: Grant | None = None,
     ) -> VideoResult:
         script = dict(part.partition("=")[::2] for part in path.read_text().split())
         frames = int(script.get("frames", "4"))
@@ -69,6 +79,13 @@ class ScriptedEngine:
         if "flaky" in script and not Path(script["flaky"]).exists():
             Path(script["flaky"]).touch()
             raise DecodeCrashed(f"{path}: the decoder died")
+        if "gpu-log" in script:
+            with Path(script["gpu-log"]).open("a") as log:
+                log.write(f"{video.key} {grant and (grant.memory_bytes, grant.low_memory)}\n")
+        if "needs" in script:
+            _take_gpu_memory(path, grant, *(int(float(gb) * 1e9) for gb in script["needs"].split("/")))
+        if "planned" in script and grant is not None and grant.memory_bytes < float(script["planned"]) * 1e9:
+            raise OutOfDeviceMemory(f"{path}: too large", int(float(script["planned"]) * 1e9))
         if "die" in script:
             self._die()
         if "die-once" in script and not Path(script["die-once"]).exists():
@@ -93,6 +110,13 @@ class ScriptedEngine:
             raise ProcessDeath
         os.kill(os.getpid(), signal.SIGSEGV)
         time.sleep(60)
+
+
+def _take_gpu_memory(path: Path, grant: Grant | None, full_bytes: int, low_bytes: int) -> None:
+    """What an allocator does that is given a part of a GPU."""
+    assert grant is not None
+    if (low_bytes if grant.low_memory else full_bytes) > grant.memory_bytes:
+        raise OutOfDeviceMemory(f"{path}: the GPU's memory ran out")
 
 
 def _first_time(marker: str | None) -> bool:

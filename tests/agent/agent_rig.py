@@ -11,6 +11,7 @@ from services.agent.backoff import GiveBacks
 from services.agent.commits import Committer
 from services.agent.config import AgentConfig
 from services.agent.executor import Died
+from services.agent.gpus import GpuShares
 from services.agent.leases import LeaseBook, LiveLease
 from services.agent.messages import AnnotateVideo, Cancelled, Reply, SlotProgress, Task
 from services.agent.slot import Slot, SlotConfig
@@ -110,11 +111,12 @@ class Rig:
     root: Path
     config: AgentConfig
     store: SqlStore
+    shares: GpuShares | None = None
     clock: FakeClock = field(default_factory=FakeClock)
     metrics: Metrics = field(default_factory=Metrics)
 
     @classmethod
-    def make(cls, root: Path, **settings: object) -> Rig:
+    def make(cls, root: Path, shares: GpuShares | None = None, **settings: object) -> Rig:
         settings.setdefault("backoff_base_s", 0.0)  # A shard that was given back can be leased again at once.
         config = AgentConfig(
             scratch_dir=root / "scratch",
@@ -122,7 +124,7 @@ class Rig:
             lease_ttl_s=60.0,
             **settings,  # type: ignore[arg-type]
         )
-        return cls(root, config, SqlStore(f"sqlite:///{root}/vipe.db"))
+        return cls(root, config, SqlStore(f"sqlite:///{root}/vipe.db"), shares)
 
     def __post_init__(self) -> None:
         self.slot = MemorySlot(self.config, self.clock)
@@ -138,6 +140,7 @@ class Rig:
             self.metrics,
             self.clock,
             self.clock.sleep,
+            self.shares,
         )
 
     def job(self, scripts: dict[str, str], *, preset: str = "classical", create_once: bool = True) -> str:

@@ -85,6 +85,7 @@ class ThreadExecutor:
         self.restarts = 0
         self.lost = False
         self.stopped = False
+        self.shares = None
 
     def start(self) -> None:
         if self.failures:

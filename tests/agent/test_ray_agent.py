@@ -9,6 +9,7 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -303,3 +304,31 @@ def test_the_real_engine_on_what_users_drop_into_a_folder(tmp_path: Path) -> Non
     assert all(name in str(rows[name].error_message) for name in ("corrupt", "empty", "text", "audio"))
     assert (tmp_path / "out" / "meta.parquet").exists()
     assert not list((tmp_path / "scratch").glob("job_*"))
+
+
+def test_slots_share_a_gpu_and_a_large_video_gets_more_of_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Real workers with parts of a GPU that Ray only counts; its memory is told in the one place that asks for it."""
+    monkeypatch.setattr("services.agent.ray_executor.gpu_memory_bytes", lambda: (24 * 10**9,))
+    config = replace(_config(tmp_path), device="cuda", slots=None, slots_per_gpu=2)
+    executor = RayExecutor(config)
+    log = tmp_path / "log"
+    store = SqlStore(f"sqlite:///{tmp_path}/vipe.db")
+    agent = Agent(store, config, executor, Metrics())
+    agent.start()
+    try:
+        small = f"gpu-log={log} slow=1"
+        job_id = _submit(store, tmp_path, {"a": small, "large": f"gpu-log={log} planned=15"}, {"b": small, "c": small})
+        assert _finished(store, job_id).state is JobState.SUCCEEDED
+        handles = executor.slots()
+        assert len(handles) == 2
+        assert len({handle.place for handle in handles}) == 1
+        assert handles[0].place.endswith("/gpu-0")
+    finally:
+        agent.stop()
+        store.close()
+    assert {row.status for row in _rows(tmp_path, job_id).values()} == {VideoStatus.SUCCEEDED}
+    granted = [line.split("(")[1] for line in log.read_text().splitlines() if line.startswith("large-")]
+    assert executor.shares is not None
+    plan = executor.shares.plan
+    assert granted == [f"{plan.bytes_of(1)}, False)", f"{plan.bytes_of(2)}, False)"]
+    assert plan.bytes_of(1) < 15e9 < plan.bytes_of(2)

@@ -9,40 +9,56 @@ import pytest
 
 from services.agent import ray_executor
 from services.agent.config import AgentConfig, config_from_settings
-from services.agent.ray_executor import RayExecutor, slots_on_this_machine
+from services.agent.ray_executor import RayExecutor
 from services.settings import Settings
 from vipe_core.errors import ConfigError
 
 
 @pytest.fixture
 def gpus(monkeypatch: pytest.MonkeyPatch) -> list[int]:
-    """Its only entry is the number of GPUs that PyTorch finds."""
-    number = [1]
-    monkeypatch.setattr(ray_executor, "count_gpus", lambda: number[0])
-    return number
+    """The memory of each GPU that PyTorch finds."""
+    memory_bytes = [141 * 10**9]
+    monkeypatch.setattr(ray_executor, "gpu_memory_bytes", lambda: tuple(memory_bytes))
+    monkeypatch.setattr(ray_executor.os, "cpu_count", lambda: 64)
+    return memory_bytes
 
 
-def test_without_a_number_there_is_a_slot_per_gpu(tmp_path: Path, gpus: list[int]) -> None:
+def _slots(executor: RayExecutor) -> int | None:
+    return executor._num_slots
+
+
+def test_slots_are_planned_from_the_memory_of_the_gpus_and_the_preset(tmp_path: Path, gpus: list[int]) -> None:
     config = config_from_settings(Settings(data_dir=tmp_path, device="cuda"))
-    assert slots_on_this_machine(config) == 1
-    gpus[0] = 8
-    assert slots_on_this_machine(config) == 8
-    assert slots_on_this_machine(replace(config, gpus_per_slot=0.5)) == 16
-    assert slots_on_this_machine(config_from_settings(Settings(data_dir=tmp_path, device="cuda", num_slots=3))) == 3
+    assert _slots(RayExecutor(config)) == 8
+    gpus.append(24 * 10**9)
+    small = RayExecutor(config)
+    assert small.shares is not None
+    per_gpu = small.shares.plan.per_gpu
+    assert 2 <= per_gpu < 8
+    assert _slots(small) == 2 * per_gpu
+    # The paper's networks take most of a small GPU.
+    paper = RayExecutor(replace(config, gpu_preset="vipe"))
+    assert paper.shares is not None
+    assert paper.shares.plan.per_gpu == 1
+    assert _slots(RayExecutor(replace(config, slots_per_gpu=5))) == 10
+    assert _slots(RayExecutor(config_from_settings(Settings(data_dir=tmp_path, device="cuda", num_slots=3)))) == 3
 
 
-def test_without_gpus_there_is_a_slot_per_core(tmp_path: Path, gpus: list[int]) -> None:
-    gpus[0] = 0
-    assert 1 <= slots_on_this_machine(config_from_settings(Settings(data_dir=tmp_path))) <= 4
+def test_without_gpus_there_is_a_slot_per_core(tmp_path: Path) -> None:
+    executor = RayExecutor(config_from_settings(Settings(data_dir=tmp_path)))
+    assert 1 <= (_slots(executor) or 0) <= 4
+    assert executor.shares is None
 
 
-def test_more_slots_than_gpus_are_refused_before_anything_starts(tmp_path: Path, gpus: list[int]) -> None:
-    config = AgentConfig(scratch_dir=tmp_path, device="cuda", slots=4)
-    with pytest.raises(ConfigError, match="4 slots need 4 GPUs, this machine has 1"):
+def test_more_slots_than_fit_are_refused_before_anything_starts(tmp_path: Path, gpus: list[int]) -> None:
+    config = AgentConfig(scratch_dir=tmp_path, device="cuda", slots=9)
+    with pytest.raises(ConfigError, match="9 slots do not fit on 1 GPUs of 141 GB"):
         RayExecutor(config)
-    gpus[0] = 0
+    gpus.clear()
     with pytest.raises(ConfigError, match="no GPU"):
         RayExecutor(replace(config, slots=None))
+    with pytest.raises(ValueError, match="unknown preset 'fast'"):
+        Settings(data_dir=tmp_path, gpu_preset="fast")
 
 
 def test_a_start_that_fails_half_way_leaves_nothing_behind(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

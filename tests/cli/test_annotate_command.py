@@ -83,6 +83,9 @@ def test_the_table_for_people(vipectl: Run, clip: Path, tmp_path: Path) -> None:
     assert done.returncode == 0, done.stderr
     assert "my-clip" in done.stdout
     assert "192x144" in done.stdout
+    stages = [line.split()[0] for line in done.stdout.splitlines() if line.rstrip().endswith("%")]
+    assert stages[0] == "scan"
+    assert {"track", "backend", "infill", "depth"} <= set(stages)
     assert (tmp_path / "out/depth/my-clip.zip").is_file()
 
 

@@ -271,7 +271,7 @@ def test_slots_are_as_many_as_the_gpus_of_the_cluster() -> None:
         group["replicas"] * int(group["template"]["spec"]["containers"][0]["resources"]["limits"]["nvidia.com/gpu"])
         for group in groups
     )
-    assert int(settings["VIPE_NUM_SLOTS"]) == gpus
+    assert int(settings["VIPE_NUM_SLOTS"]) == gpus * int(settings["VIPE_SLOTS_PER_GPU"])
 
 
 def test_probes_ask_what_minimal_ray_answers() -> None:

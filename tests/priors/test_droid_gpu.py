@@ -1,4 +1,4 @@
-"""The DROID network on a GPU against itself on a CPU, with its graphs and kernels against without; planned memory."""
+"""The DROID network on a GPU against itself on a CPU, with its graphs and kernels against without."""
 
 from __future__ import annotations
 
@@ -6,12 +6,10 @@ import numpy as np
 import pytest
 import torch
 
-from vipe_core.ba.problem import Grid
 from vipe_core.priors.droid import DroidMatcher, DroidNetwork
 from vipe_core.priors.droid.correlation import FeatureCorrelation, VolumeCorrelation
 from vipe_core.priors.droid.features import DroidFeatures
 from vipe_core.priors.droid.kernels import lookup_kernels
-from vipe_core.priors.droid.memory import plan_memory, volumes_fit
 from vipe_core.priors.protocols import Refined, WorkingFrame
 
 needs_gpu = pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU")
@@ -79,31 +77,3 @@ def test_kernels_look_up_what_torch_looks_up(dtype: torch.dtype, monkeypatch: py
             patched.setattr("vipe_core.priors.droid.correlation.lookup_kernels", lambda *_: None)
             expected = correlation.lookup(cells)
         torch.testing.assert_close(found.float(), expected.float(), atol=2e-2, rtol=1e-2)
-
-
-def test_memory_is_planned_from_sizes_and_volumes_give_way_on_small_devices() -> None:
-    grid = Grid(48, 64, 8.0, 4.0)
-    both = [
-        plan_memory(
-            grid,
-            keyframes=keyframes,
-            window_edges=48,
-            edges_per_keyframe=16,
-            most_edges=6000,
-            fill_frames=16,
-            cache_bytes=256 << 20,
-            lean=lean,
-        )
-        for lean in (False, True)
-        for keyframes in (50, 1500)
-    ]
-    few, many, few_lean, many_lean = both
-    assert few_lean.total_bytes < few.total_bytes < many.total_bytes
-    assert few.work_bytes == many.work_bytes
-    # 25 MB of volumes an edge at 512 x 384.
-    assert few.work_bytes > 2 * 48 * 25e6
-    assert few_lean.work_bytes < few.work_bytes - 48 * 12e6
-    assert few.slots(80 << 30) > few.slots(24 << 30) >= 1
-    assert many_lean.slots(1 << 30) == 0
-    assert volumes_fit(grid, 48, 16 << 30)
-    assert not volumes_fit(grid, 48, 4 << 30)

@@ -62,7 +62,7 @@ class RoomRefiner:
 
     # -- Refiner ---------------------------------------------------------------------------------------------------
 
-    def begin(self, grid: Grid, *, lean: bool) -> _Refinement:
+    def begin(self, grid: Grid, *, lean: bool, spilled: bool = False) -> _Refinement:
         assert grid == GRID
         self.lean.append(lean)
         return _Refinement(self)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import logging
-import time
 from collections.abc import Generator, Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
@@ -32,9 +31,18 @@ from vipe_core.depth.scene import scene_of
 from vipe_core.depth.stream import DenseDepth
 from vipe_core.depth.types import DepthFrame
 from vipe_core.depth.without import NoDepth
-from vipe_core.errors import ConfigError, EngineError, VipeError
-from vipe_core.pipeline.device import describe_device, resolve_device, set_threads
+from vipe_core.errors import ConfigError, EngineError, OutOfDeviceMemory, VipeError
+from vipe_core.pipeline.device import (
+    describe_device,
+    device_memory_bytes,
+    limit_memory,
+    ran_out_of_memory,
+    release_memory,
+    resolve_device,
+    set_threads,
+)
 from vipe_core.pipeline.masking import find_instances
+from vipe_core.pipeline.memory import USABLE_SHARE, MemoryBudget
 from vipe_core.pipeline.presets import Preset, PresetOptions, resolve
 from vipe_core.pipeline.provenance import engine_version, library_versions
 from vipe_core.pipeline.providers import open_depth, open_masks, open_priors, require_libraries
@@ -43,7 +51,8 @@ from vipe_core.priors.classical.panoramic import looks_panoramic
 from vipe_core.priors.weights import require_all
 from vipe_core.quality import assess
 from vipe_core.slam.panorama import PanoramaSlam
-from vipe_core.slam.system import Slam
+from vipe_core.slam.system import Slam, SlamResult
+from vipe_core.slam.timing import StageClock
 from vipe_core.video import MaskedView, open_source
 from vipe_core.video.instances import InstanceMaps, InstanceView
 from vipe_core.video.resampled import ResampledView
@@ -71,6 +80,7 @@ class Annotator:
         ConfigError: Preset, camera, device or options are not on offer.
         LibraryMissing, WeightsMissing, WeightsInvalid: What the preset needs is not on this machine; the message says
             what gets it.
+        OutOfDeviceMemory: Its networks do not fit on the GPU.
     """
 
     def __init__(
@@ -88,9 +98,17 @@ class Annotator:
         set_threads(threads)
         require_libraries(self.preset.providers.values())
         self._weights = require_all(self.preset.weights)
-        self._priors = open_priors(self.preset.matcher, self.preset.intrinsics, self.preset.camera, self.device)
-        self._depth = open_depth(self.preset.depth, self.preset.metric, self.device)
-        self._masks = open_masks(self.preset.masks, self.preset.instances, self.device)
+        try:
+            self._priors = open_priors(self.preset.matcher, self.preset.intrinsics, self.preset.camera, self.device)
+            self._depth = open_depth(self.preset.depth, self.preset.metric, self.device)
+            self._masks = open_masks(self.preset.masks, self.preset.instances, self.device)
+        except RuntimeError as error:
+            if ran_out_of_memory(error):
+                raise OutOfDeviceMemory(
+                    f"the networks of preset {self.preset.name} do not fit in what is free of the GPU's memory: end "
+                    "what else runs on it, run fewer videos on it at once, or take a smaller preset"
+                ) from error
+            raise
 
     def annotate(
         self,
@@ -100,6 +118,8 @@ class Annotator:
         masks: str | Path | None = None,
         scale_from: str | None = None,
         calibration: Calibration | str | Path | None = None,
+        memory_bytes: int | None = None,
+        low_memory: bool = False,
         progress: ProgressCallback | None = None,
     ) -> Annotation:
         """Poses, camera and quality of a video file or a directory of images; dense depth when it is asked for.
@@ -115,9 +135,13 @@ class Annotator:
             calibration: The camera where it is known, or its file (`cameras.calibration_files`), in place of the model
                 that the preset estimates. A fixed one is returned as it was given. Of a lens with measured
                 distortion the pictures are resampled for the work, and all outputs are for the pictures as they are.
+            memory_bytes: What the video may take of the GPU, where others share it; nearly all if None. A video that
+                would not fit is refined in the low-memory profile. Without meaning on a CPU.
+            low_memory: That profile, whatever would fit: on a GPU, slower and the same but for the last digits.
             progress: Told how far the annotation is; an exception out of it ends the annotation.
 
         Raises:
+            OutOfDeviceMemory: The low-memory profile does not fit either, or memory ran out in the work.
             InputError, DecodeError: The input cannot be read, or the masks (MaskMismatch) or the calibration
                 (CalibrationMismatch) are not of this video. Code and message are meant for the user.
             ScaleUnobservable: The video does not show the known length.
@@ -131,26 +155,25 @@ class Annotator:
         given = known_camera(calibration, source)
         report = Reporter(progress)
         instances: InstanceMaps | None = None
-        masks_start_s = time.perf_counter()
+        clock = StageClock(self.device)
+        budget = self._budget(memory_bytes, low_memory=low_memory)
         if self._masks is not None:
-            with typed_errors(source, report):
+            with typed_errors(source, report), clock("masks"):
                 instances = find_instances(source, self._masks, report)
             source = InstanceView(source, instances)
-        masks_s = time.perf_counter() - masks_start_s
         source = undistorted(source, given)
 
         with typed_errors(source, report), torch.inference_mode():
             if given is None:
-                result = self._slam(self._model(source)).run(source, report)
+                result = self._slam(self._model(source), budget).run(source, report)
             else:
-                slam = Slam(self._priors(), self.preset.slam, self.device)
+                slam = Slam(self._priors(), self.preset.slam, self.device, budget.fit)
                 result = slam.run(source, report, camera_to_solve(given, source))
+            clock = self._clock(result, clock)
             quality = assess(result, self.preset.slam, source.info.width)
-            scaled = set_scale(scene_of(result), source, known, self._depth.metric, report)
+            with clock("scale"):
+                scaled = set_scale(scene_of(result), source, known, self._depth.metric, report)
             quality = dataclasses.replace(quality, scale_sigma_ratio=scaled.sigma_ratio)
-        timings = dict(result.timings_s)
-        if instances is not None:
-            timings = {"masks": masks_s, **timings}
         logger.info(
             "%s: %d frames, %d keyframes, reliable: %s %s",
             source.info.name,
@@ -169,9 +192,10 @@ class Annotator:
             scale=scaled.scale,
             depth_kind=depth_kind_of(result.camera),
             quality=quality,
-            provenance=self._provenance(source, scaled, given),
-            dense=lambda: self._dense(source, scaled, instances, timings, report),
-            timings_s=timings,
+            provenance=self._provenance(source, scaled, given, lean=result.lean),
+            dense=lambda: self._dense(source, scaled, instances, clock, report),
+            timings_s=clock.seconds,
+            peak_bytes=clock.peak_bytes,
             mask_phrases=dict(MASK_PHRASES) if instances is None else instances.phrases,
         )
 
@@ -184,15 +208,37 @@ class Annotator:
         with closing(source.frames(stop=_PICTURES_LOOKED_AT)) as frames:
             return "equirect" if looks_panoramic([frame.rgb for frame in frames]) else "auto"
 
-    def _slam(self, model: str) -> Slam | PanoramaSlam:
+    def release(self) -> None:
+        """Give back what is kept of the GPU for the next video, so that others on it may take it."""
+        release_memory(self.device)
+
+    def _budget(self, memory_bytes: int | None, *, low_memory: bool) -> MemoryBudget:
+        """What a video may take of the device, bound there from now on."""
+        total_bytes = device_memory_bytes(self.device)
+        if memory_bytes is None and total_bytes is not None:
+            memory_bytes = int(USABLE_SHARE * total_bytes)
+        if memory_bytes is not None:
+            limit_memory(self.device, memory_bytes)
+        return MemoryBudget(self.preset, memory_bytes, lean=low_memory)
+
+    def _clock(self, result: SlamResult, before: StageClock | None = None) -> StageClock:
+        """What the stages so far took; those that follow are added."""
+        clock = before or StageClock(self.device)
+        clock.seconds.update(result.timings_s)
+        clock.peak_bytes.update(result.peak_bytes)
+        return clock
+
+    def _slam(self, model: str, budget: MemoryBudget) -> Slam | PanoramaSlam:
         priors = self._priors()
         if model != "equirect":
-            return Slam(priors, self.preset.slam, self.device)
+            return Slam(priors, self.preset.slam, self.device, budget.fit)
         if priors.refiner is not None:
             raise ConfigError(f"the preset {self.preset.name} does not annotate panoramas; panorama and classical do")
         return PanoramaSlam(priors, self.preset.slam, self.device)
 
-    def _provenance(self, source: FrameSource, scaled: ScaledScene, given: Calibration | None = None) -> Provenance:
+    def _provenance(
+        self, source: FrameSource, scaled: ScaledScene, given: Calibration | None = None, *, lean: bool = False
+    ) -> Provenance:
         calibration: dict[str, object] | None = None
         providers = self.preset.providers
         if given is not None:
@@ -227,6 +273,7 @@ class Annotator:
             },
             scale_source=scaled.source,
             calibration=calibration,
+            memory_profile="low" if lean else "full",
         )
 
     def _dense(
@@ -234,23 +281,22 @@ class Annotator:
         source: FrameSource,
         scaled: ScaledScene,
         instances: InstanceMaps | None,
-        timings: dict[str, float],
+        clock: StageClock,
         report: Reporter,
     ) -> Generator[DenseFrame, None, None]:
-        """Depth and mask of every frame in order; the time spent here, not in the consumer, is added to `timings`."""
+        """Depth and mask of every frame in order; the time spent here, not in the consumer, goes to `clock`."""
         total = len(scaled.scene.world_from_cam)
-        spent_s = 0.0
+        own = StageClock(self.device)
         with typed_errors(source, report):
             stream = self._depth_stage(scaled).stream(source, scaled.scene)
             if isinstance(source, ResampledView):
                 stream = _taken_back(stream, source)
         with closing(stream) as frames:
             while True:
-                start_s = time.perf_counter()
-                with typed_errors(source, report):
+                with typed_errors(source, report), own("depth"):
                     frame = next(frames, None)
-                spent_s += time.perf_counter() - start_s
-                timings["depth"] = spent_s
+                clock.seconds.update(own.seconds)
+                clock.peak_bytes.update(own.peak_bytes)
                 if frame is None:
                     return
                 mask = frame.moving.astype(np.uint8)
@@ -342,6 +388,11 @@ def typed_errors(source: FrameSource, report: Reporter) -> Iterator[None]:
     except Exception as error:
         if error is report.raised:
             raise
+        if ran_out_of_memory(error):
+            raise OutOfDeviceMemory(
+                f"{source.info.name}: the GPU's memory ran out: run fewer videos on it at once, or try the low-memory "
+                "profile"
+            ) from error
         logger.exception("%s: a stage failed", source.info.name)
         first_line = (str(error) or "no message").splitlines()[0][:300]
         raise EngineError(

@@ -7,6 +7,11 @@ import torch
 
 from vipe_core.errors import ConfigError
 
+# What the driver and its libraries take of a GPU for a process, whatever it does.
+_CONTEXT_BYTES = 500 << 20
+# How CUDA, its libraries and our kernels' launcher say it.
+_OUT_OF_MEMORY = ("CUDA out of memory", "out of memory", "OUT_OF_MEMORY", "ALLOC_FAILED")
+
 
 def resolve_device(name: str) -> torch.device:
     """The torch device called `name`: `cpu`, `cuda` or `cuda:N`.
@@ -30,6 +35,37 @@ def resolve_device(name: str) -> torch.device:
     if device.index is not None and device.index >= torch.cuda.device_count():
         raise ConfigError(f"device {name!r}: this machine has {torch.cuda.device_count()} GPU(s), counted from 0")
     return device
+
+
+def device_memory_bytes(device: torch.device) -> int | None:
+    """All memory of a GPU; None for a CPU."""
+    if device.type == "cpu":
+        return None
+    return int(torch.cuda.get_device_properties(device).total_memory)
+
+
+def limit_memory(device: torch.device, size_bytes: int) -> None:
+    """Bound what this process takes of a GPU from now on: what shares the GPU with it keeps its own part.
+
+    The driver's and the libraries' part is not torch's to bound; it is taken off.
+    """
+    total_bytes = device_memory_bytes(device)
+    if total_bytes is not None:
+        share = max(size_bytes - _CONTEXT_BYTES, 0) / total_bytes
+        torch.cuda.set_per_process_memory_fraction(min(share, 1.0), device)
+
+
+def release_memory(device: torch.device) -> None:
+    """Give back what torch keeps for later, so that others on the GPU may take it."""
+    if device.type == "cuda":
+        torch.cuda.empty_cache()
+
+
+def ran_out_of_memory(error: BaseException) -> bool:
+    """Whether a library failed because the GPU's memory is taken."""
+    if isinstance(error, torch.OutOfMemoryError):
+        return True
+    return isinstance(error, RuntimeError) and any(sign in str(error) for sign in _OUT_OF_MEMORY)
 
 
 def describe_device(device: torch.device, threads: int) -> str:

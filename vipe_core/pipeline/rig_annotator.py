@@ -126,7 +126,7 @@ class RigAnnotator(Annotator):
         report: Reporter,
     ) -> Annotation:
         """One view by itself."""
-        timings = dict(found.timings_s)
+        clock = self._clock(found)
         quality = assess(found, self.preset.slam, source.info.width)
         return Annotation(
             name=source.info.name,
@@ -139,8 +139,9 @@ class RigAnnotator(Annotator):
             depth_kind=depth_kind_of(found.camera),
             quality=dataclasses.replace(quality, scale_sigma_ratio=scaled.sigma_ratio),
             provenance=self._provenance(source, scaled, given),
-            dense=lambda: self._dense(source, scaled, None, timings, report),
-            timings_s=timings,
+            dense=lambda: self._dense(source, scaled, None, clock, report),
+            timings_s=clock.seconds,
+            peak_bytes=clock.peak_bytes,
         )
 
 

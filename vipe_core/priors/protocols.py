@@ -152,12 +152,13 @@ class Refiner(Protocol):
     @property
     def offset_px(self) -> float: ...
 
-    def begin(self, grid: Grid, *, lean: bool) -> Refinement:
+    def begin(self, grid: Grid, *, lean: bool, spilled: bool = False) -> Refinement:
         """A refinement without edges.
 
         Args:
             grid: Cells of the frames.
             lean: Rather slower than with memory that grows with the edges by more than their states: for whole graphs.
+            spilled: The states of edges, too, lie in the memory of the host between two updates.
         """
 
 

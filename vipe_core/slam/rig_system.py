@@ -123,7 +123,7 @@ class RigSlam:
         """
         if len(source.infos) != len(rig.cameras):
             raise ConfigError(f"the rig has {len(rig.cameras)} views, but there are {len(source.infos)} videos")
-        clock, settings = StageClock(), self._settings
+        clock, settings = StageClock(self._device), self._settings
         size = _common_size(source.infos, rig.cameras, settings.working_area_px)
         frames = EncodedRig(source, size, self._priors.matcher, settings.frame_cache_bytes)
         with clock("scan"):
@@ -149,7 +149,7 @@ class RigSlam:
             frames.release()
         keyframes = done.keyframes
         assert keyframes.cam_from_rig is not None
-        views = _views(done, trajectories, selection, size, clock.seconds)
+        views = _views(done, trajectories, selection, size, clock)
         return RigSlamResult(
             tuple(_in_its_model(view, camera) for view, camera in zip(views, rig.cameras, strict=True)),
             done.found,
@@ -299,7 +299,7 @@ def _views(
     trajectories: Sequence[Trajectory],
     selection: RigSelection,
     size: WorkingSize,
-    timings_s: dict[str, float],
+    clock: StageClock,
 ) -> tuple[SlamResult, ...]:
     """The results of the views, in the world of the first camera of view 0."""
     keyframes, views = done.keyframes, done.keyframes.num_views
@@ -328,7 +328,8 @@ def _views(
                     done.loops.residual_after_px,
                     done.loops.moved_ratio,
                 ),
-                timings_s=timings_s,
+                timings_s=clock.seconds,
+                peak_bytes=clock.peak_bytes,
             )
         )
     return tuple(results)

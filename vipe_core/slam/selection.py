@@ -173,6 +173,10 @@ class _Pass:
         self.cuts: list[int] = []
         self.shot_of: dict[int, int] = {}
 
+    @property
+    def num_keyframes(self) -> int:
+        return sum(len(motion.keyframes) for motion in self.filters)
+
     def place(self, placed: list[Placed]) -> None:
         for one in placed:
             picture = one.picture
@@ -184,7 +188,13 @@ class _Pass:
             self.filters[-1].add(Keyframe(picture.index, picture.features))
 
 
-def select_keyframes(frames: EncodedFrames, size: WorkingSize, settings: SlamSettings, report: Report) -> Selection:
+def select_keyframes(
+    frames: EncodedFrames,
+    size: WorkingSize,
+    settings: SlamSettings,
+    report: Report,
+    counted: Callable[[int], object] | None = None,
+) -> Selection:
     """Read the video once (again for each lowering of the threshold of slow shots), find its cuts, choose keyframes.
 
     Blank frames (a fade from black) and single ones that belong to nothing (a flash) are passed over: any picture
@@ -192,6 +202,7 @@ def select_keyframes(frames: EncodedFrames, size: WorkingSize, settings: SlamSet
 
     Args:
         frames: Before their first pass.
+        counted: Told the number of keyframes while it grows; what it raises ends the selection.
 
     Raises:
         EmptyMedia: The video holds no frame.
@@ -211,6 +222,8 @@ def select_keyframes(frames: EncodedFrames, size: WorkingSize, settings: SlamSet
                 first_blank = first_blank or Keyframe(frame.index, features)
             else:
                 found.place(splitter.add(Picture.of(frame, features)))
+                if counted is not None:
+                    counted(found.num_keyframes)
             report("scan", frame.index + 1, frames.total_hint)
     found.place(splitter.finish())
     for motion in found.filters:

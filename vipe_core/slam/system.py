@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 import torch
@@ -27,6 +28,8 @@ from vipe_core.slam.timing import StageClock
 from vipe_core.slam.working import WorkingSize, working_size
 from vipe_core.slam.zoom import NO_ZOOM, Zoom
 from vipe_core.video.source import FrameSource, VideoInfo
+
+Lean = Callable[[str, Grid, int], bool]
 
 # How closely the later shots hold the focal length that the main one found: they share a camera.
 _SAME_FOCAL_SIGMA = 1e-4
@@ -70,6 +73,8 @@ class SlamResult:
         map: Diagnostics, with the confidence of every inverse depth.
         loops: What the loop edges of the main shot did.
         timings_s: Wall seconds per stage.
+        peak_bytes: Most memory of the GPU per stage; empty on a CPU.
+        lean: Whether measurements were refined in the low-memory profile.
         zoom: Of the shot whose focal length changes most.
         rig: Of a view of a rig, else None.
     """
@@ -90,6 +95,8 @@ class SlamResult:
     timings_s: dict[str, float]
     zoom: Zoom = NO_ZOOM
     rig: ViewOfRig | None = None
+    peak_bytes: dict[str, int] = field(default_factory=dict)
+    lean: bool = False
 
     @property
     def grid(self) -> Grid:
@@ -99,16 +106,23 @@ class SlamResult:
 class Slam:
     """The stage with its components; reusable for any number of videos, one at a time.
 
+    Args:
+        lean: Told the name of a video, its grid and the number of its keyframes so far: whether it is to be refined in
+            the low-memory profile. What it raises ends the run.
+
     Raises:
         ConfigError: The settings turn off the only measurements that the priors give.
     """
 
-    def __init__(self, priors: PriorFamily, settings: SlamSettings, device: torch.device) -> None:
+    def __init__(
+        self, priors: PriorFamily, settings: SlamSettings, device: torch.device, lean: Lean | None = None
+    ) -> None:
         if not settings.terms.dense_flow and priors.tracker is None:
             raise ConfigError("the term dense_flow can only be off where the preset has sparse tracks")
         self._priors = priors
         self._settings = settings
         self._device = device
+        self._lean = lean
 
     def run(self, source: FrameSource, report: Report, known: Calibration | None = None) -> SlamResult:
         """Pose every frame of the video.
@@ -120,7 +134,7 @@ class Slam:
         Raises:
             InputError, DecodeError: From the source; EmptyMedia when it holds no frame.
         """
-        clock = StageClock()
+        clock = StageClock(self._device)
         settings = self._settings
         refiner = self._priors.refiner
         offset_px = None if refiner is None else refiner.offset_px
@@ -128,8 +142,12 @@ class Slam:
         aspect = info.pixel_aspect if known is None else known.camera.params[1] / known.camera.params[0]
         size = working_size(info.width, info.height, settings.working_area_px, offset_px=offset_px, pixel_aspect=aspect)
         frames = EncodedFrames(source, size, self._priors.matcher, settings.frame_cache_bytes)
+        decide = self._lean
+        counted = None if decide is None else partial(decide, info.name, size.grid)
         with clock("scan"):
-            selection = select_keyframes(frames, size, settings, report)
+            selection = select_keyframes(frames, size, settings, report, counted)
+        if counted is not None and counted(sum(len(shot.keyframes) for shot in selection.shots)):
+            settings = replace(settings, refinement=replace(settings.refinement, lean=True))
         main = max(range(len(selection.shots)), key=lambda number: len(selection.shots[number].keyframes))
         with clock("intrinsics"):
             if known is None:
@@ -173,6 +191,8 @@ class Slam:
             map=combine([one.found for one in maps]),
             loops=maps[main].loops,
             timings_s=clock.seconds,
+            peak_bytes=clock.peak_bytes,
+            lean=refiner is not None and settings.refinement.lean,
             zoom=max((one.zoom for one in maps), key=lambda zoom: (zoom.changes, zoom.ratio)),
         )
 

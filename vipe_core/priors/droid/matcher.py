@@ -14,7 +14,6 @@ from vipe_core.ba.problem import Grid
 from vipe_core.priors.classical.features import FlowFeatures
 from vipe_core.priors.classical.flow import DisFlowMatcher
 from vipe_core.priors.droid.features import OFFSET_PX, STRIDE, DroidFeatures, encoded
-from vipe_core.priors.droid.memory import volumes_fit
 from vipe_core.priors.droid.network import DroidNetwork
 from vipe_core.priors.droid.refinement import DroidRefinement
 from vipe_core.priors.protocols import Match, WorkingFrame
@@ -24,8 +23,6 @@ Array = NDArray[Any]
 # Updates of a match that no bundle adjustment takes part in.
 _UPDATES = 8
 _FAST_UPDATES = 4
-# About as many edges are refined at a time.
-_EDGES = 48
 # A cell whose forward and backward flows disagree by more than this many pixels and this share of the flow is wrong.
 _CONSISTENT_PX = 2.0
 _CONSISTENT_RATIO = 0.05
@@ -85,12 +82,9 @@ class DroidMatcher:
         """One-way measurement; what the network is sure of counts as consistent."""
         return self._flow([(source, target)], [guess_px], _FAST_UPDATES)[0]
 
-    def begin(self, grid: Grid, *, lean: bool) -> DroidRefinement:
-        """See `Refiner.begin`. On a small GPU every refinement is lean: its size decides, not what is free just now."""
-        device = self._network.device
-        if device.type == "cuda":
-            lean = lean or not volumes_fit(grid, _EDGES, torch.cuda.get_device_properties(device).total_memory)
-        return DroidRefinement(self._network, grid, lean=lean)
+    def begin(self, grid: Grid, *, lean: bool, spilled: bool = False) -> DroidRefinement:
+        """See `Refiner.begin`."""
+        return DroidRefinement(self._network, grid, lean=lean, spilled=spilled)
 
     def _between(self, pairs: Sequence[tuple[DroidFeatures, DroidFeatures]]) -> tuple[DroidRefinement, Tensor]:
         """A refinement of pairs that stand still, and (E, P, 2) where that sees the cells."""

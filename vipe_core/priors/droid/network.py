@@ -7,6 +7,7 @@ from contextlib import contextmanager
 
 import torch
 from torch import Tensor, nn
+from torch.nn import functional
 
 from vipe_core.priors.droid.encoder import Encoder
 from vipe_core.priors.droid.graphs import GraphCache
@@ -17,6 +18,8 @@ FEATURES = 128
 
 _MEAN = (0.485, 0.456, 0.406)
 _STD = (0.229, 0.224, 0.225)
+# Edges and frames come in multiples of these where graphs are captured: few shapes, which repeat.
+_EDGE_STEP, _FRAME_STEP = 16, 8
 # Motion beyond this many cells is not told apart.
 _MAX_MOTION = 64.0
 
@@ -89,10 +92,19 @@ class DroidNetwork(nn.Module):
             return begin.tanh().to(self.dtype), context.relu().to(self.dtype)
 
     def step(self, hidden: Tensor, context: Tensor, correlation: Tensor, motion: Tensor, share: Tensor) -> Updated:
-        """One update; see `UpdateOperator`. `motion` is of any size."""
-        inputs = (hidden, context, correlation, motion, share)
+        """One update; see `UpdateOperator`. `motion` is of any size.
+
+        Graphs are captured for a few numbers of edges and frames; others are filled up with edges of nothing.
+        """
         with torch.inference_mode():
-            return Updated(*(self._step(*inputs) if self._graphs is None else self._graphs(*inputs)))
+            if self._graphs is None:
+                return Updated(*self._step(hidden, context, correlation, motion, share))
+            frames, edges = share.shape
+            more = -edges % _EDGE_STEP
+            filled = [_filled(given, more) for given in (hidden, context, correlation, motion)]
+            share = functional.pad(share, (0, more, 0, -frames % _FRAME_STEP))
+            state, delta, weight, damping = self._graphs(*filled, share)
+            return Updated(state[:edges], delta[:edges], weight[:edges], damping[:frames])
 
     def _step(
         self, hidden: Tensor, context: Tensor, correlation: Tensor, motion: Tensor, share: Tensor
@@ -111,3 +123,8 @@ class DroidNetwork(nn.Module):
             # Weights cast once and kept would belong to the graph in which that happened.
             with torch.autocast(self.device.type, dtype=self.dtype, cache_enabled=False):
                 yield
+
+
+def _filled(given: Tensor, more: int) -> Tensor:
+    """With so many more rows of zeros."""
+    return functional.pad(given, (0, 0, 0, 0, 0, 0, 0, more)) if more else given

@@ -26,10 +26,12 @@ class DroidRefinement:
 
     Args:
         lean: Products of features on the fly instead of volumes, and updates in parts.
+        spilled: States lie on the host but for the part that is updated.
     """
 
-    def __init__(self, network: DroidNetwork, grid: Grid, *, lean: bool) -> None:
+    def __init__(self, network: DroidNetwork, grid: Grid, *, lean: bool, spilled: bool = False) -> None:
         self._network, self._grid, self._lean = network, grid, lean
+        self._home = torch.device("cpu") if spilled else network.device
         self._cells = _own_cells(grid, network.device)
         self._pairs: list[tuple[DroidFeatures, DroidFeatures]] = []
         self._correlation: Correlation | None = None
@@ -44,7 +46,7 @@ class DroidRefinement:
         if not pairs:
             return
         self._pairs += pairs
-        begin = torch.stack([source.context[0] for source, _ in pairs])
+        begin = torch.stack([source.context[0].to(self._home) for source, _ in pairs])
         said = self._in_cells(seen_px)
         self._hidden = begin if self._hidden is None else torch.cat((self._hidden, begin))
         self._said = said if self._said is None else torch.cat((self._said, said))
@@ -63,7 +65,7 @@ class DroidRefinement:
             return
         index = torch.tensor(list(rows), dtype=torch.int64, device=self._network.device)
         self._pairs = [self._pairs[row] for row in rows]
-        self._hidden, self._said = self._hidden[index], self._said[index]
+        self._hidden, self._said = self._hidden[index.to(self._home)], self._said[index]
         if self._correlation is not None:
             self._correlation = None if self._lean else self._correlation.kept(index)
 
@@ -81,17 +83,19 @@ class DroidRefinement:
         correlation = self._correlated()
         for rows in self._parts(sources):
             index = torch.tensor(rows, dtype=torch.int64, device=device)
+            at_home = index.to(self._home)
             some = correlation if len(rows) == len(self) else correlation.kept(index)
             motion = torch.cat((seen[index] - self._cells, self._said[index] - seen[index]), dim=-1)
             updated = self._network.step(
-                self._hidden[index],
+                self._hidden[at_home].to(device),
                 torch.stack([self._pairs[row][0].context[1] for row in rows]),
                 some.lookup(seen[index]).to(self._network.dtype),
                 motion.permute(0, 3, 1, 2),
                 shares(numbers[index])[1],
             )
             # In place, part by part: the states of a large graph are most of what there is.
-            self._hidden[index] = updated.hidden.to(self._hidden.dtype).nan_to_num(0.0, 1.0, -1.0)
+            hidden = updated.hidden.to(self._hidden.dtype).nan_to_num(0.0, 1.0, -1.0)
+            self._hidden[at_home] = hidden.to(self._home)
             said[index] = seen[index] + updated.delta.permute(0, 2, 3, 1)
             weight[index] = updated.weight.permute(0, 2, 3, 1)
             dampings.append(updated.damping.flatten(1))

@@ -55,7 +55,7 @@ class RefinedBackend:
         most = min(settings.global_edges * count, settings.global_most_edges)
         reach = Reach(settings.neighbours, self._max_px, settings.global_gap, most)
         found = links(self._reprojector, self._keyframes, range(count), range(count), (), reach, settings)
-        edges = RefinedEdges(self._refiner, self._keyframes, self._adjuster, lean=True)
+        edges = RefinedEdges(self._refiner, self._keyframes, self._adjuster, lean=True, spilled=settings.lean)
         edges.add(found)
         for _ in range(updates):
             edges.update()

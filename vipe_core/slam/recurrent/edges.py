@@ -25,17 +25,19 @@ class RefinedEdges:
     """Directed edges between the keyframes of a map, refined in turns with it.
 
     Args:
-        lean: See `Refiner.begin`.
+        lean, spilled: See `Refiner.begin`.
 
     Attributes:
         active: Edges that are refined, in the order of their rows.
         stored: Edges that are not refined any more -> where they saw the cells (P, 2), and their weights (P, 2).
     """
 
-    def __init__(self, refiner: Refiner, keyframes: KeyframeMap, adjuster: Adjuster, *, lean: bool) -> None:
+    def __init__(
+        self, refiner: Refiner, keyframes: KeyframeMap, adjuster: Adjuster, *, lean: bool, spilled: bool = False
+    ) -> None:
         self._keyframes = keyframes
         self._adjuster = adjuster
-        self._refinement = refiner.begin(keyframes.grid, lean=lean)
+        self._refinement = refiner.begin(keyframes.grid, lean=lean, spilled=spilled)
         self.active: list[Pair] = []
         self.stored: dict[Pair, tuple[Tensor, Tensor]] = {}
         self._ages: list[int] = []

@@ -37,7 +37,8 @@ class RefinementSettings:
         global_updates: Updates of a global adjustment on the way, of the first and of the second at the end.
         global_iterations: Gauss-Newton steps after each of these updates.
         fill_updates: Updates of the frames between keyframes.
-        lean: The window and the frames between keyframes, too, go without volumes of correlation; see `Refiner.begin`.
+        lean: The low-memory profile: the window and the frames between keyframes, too, go without volumes of
+            correlation, and the states of whole graphs lie on the host; see `Refiner.begin`.
     """
 
     first_neighbours: int = 3
