@@ -11,10 +11,10 @@ from clip_source import ClipSource, scene_of
 
 from vipe_core.annotation import FILLED, MEASURED, SKY, UNOBSERVED, DepthKind
 from vipe_core.cameras import Camera, CameraModel
+from vipe_core.cameras.along import inverse_along
 from vipe_core.depth.aligned import AlignedDepth
 from vipe_core.depth.alignment import AlignmentSettings
 from vipe_core.depth.projection import MapProjector
-from vipe_core.depth.scale import inverse_along
 from vipe_core.depth.types import DepthFrame, SceneMap
 from vipe_core.depth.windows import stitched
 from vipe_core.errors import ConfigError, EngineError

@@ -13,13 +13,13 @@ from hypothesis import strategies as st
 
 from vipe_core.annotation import DepthKind
 from vipe_core.cameras import Camera, CameraModel
+from vipe_core.cameras.along import inverse_along
 from vipe_core.depth.ground import scale_from_height
 from vipe_core.depth.known import KnownLength
 from vipe_core.depth.projection import MapProjector
 from vipe_core.depth.robust import consensus, weighted_median
 from vipe_core.depth.scale import (
     FrameRatio,
-    inverse_along,
     normalised,
     ratio_to_prior,
     rescaled,

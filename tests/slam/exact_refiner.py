@@ -10,10 +10,19 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from vipe_core.annotation import DepthKind
 from vipe_core.ba.problem import Grid
 from vipe_core.cameras import Camera
 from vipe_core.geometry.arrays import inverse
-from vipe_core.priors.protocols import IntrinsicsEstimate, Match, PriorFamily, Refined, WorkingFrame
+from vipe_core.priors.protocols import (
+    IntrinsicsEstimate,
+    Match,
+    MetricDepth,
+    MetricEstimate,
+    PriorFamily,
+    Refined,
+    WorkingFrame,
+)
 from vipe_core.slam.reprojection import Reprojector
 from vipe_core.video.source import Frame, VideoInfo
 
@@ -29,6 +38,7 @@ class RoomRefiner:
         share: Part of the way that an update goes.
         noise_px: Standard deviation of each update's answer.
         damping: Information on staying put that every update gives.
+        blind_cells: The last so many cells of every frame get no weight.
     """
 
     def __init__(
@@ -39,10 +49,12 @@ class RoomRefiner:
         noise_px: float = 0.1,
         damping: float = 20.0,
         fov_deg: float = 75.0,
+        blind_cells: int = 0,
     ) -> None:
         self.world_from_cam = world_from_cam
         self.camera = Camera.pinhole_from_fov(fov_deg, WIDTH, HEIGHT)
         self.share, self.noise_px, self.damping = share, noise_px, damping
+        self.blind_cells = blind_cells
         self.updates = 0
         self.lean: list[bool] = []
         self.reprojector = Reprojector("pinhole", GRID)
@@ -61,6 +73,10 @@ class RoomRefiner:
         return np.nan_to_num(induced.target_px), induced.visible
 
     # -- Refiner ---------------------------------------------------------------------------------------------------
+
+    def picture(self, features: int) -> NDArray[np.uint8]:
+        # The only pixel that matters says which frame it is.
+        return np.full((HEIGHT, WIDTH, 3), features, dtype=np.uint8)
 
     def begin(self, grid: Grid, *, lean: bool, spilled: bool = False) -> _Refinement:
         assert grid == GRID
@@ -88,8 +104,8 @@ class RoomRefiner:
 
     # -- the initial camera ----------------------------------------------------------------------------------------
 
-    def priors(self, fov_deg: float, sigma: float) -> PriorFamily:
-        return PriorFamily(self, None, None, _Guess(fov_deg, sigma), refiner=self)
+    def priors(self, fov_deg: float, sigma: float, metric: MetricDepth | None = None) -> PriorFamily:
+        return PriorFamily(self, None, None, _Guess(fov_deg, sigma), refiner=self, metric=metric)
 
     # -- the frame source ------------------------------------------------------------------------------------------
 
@@ -101,6 +117,33 @@ class RoomRefiner:
         blank = np.zeros((HEIGHT, WIDTH, 3), dtype=np.uint8)
         for index in range(len(self.world_from_cam))[start:stop]:
             yield Frame(index, index / 30.0, blank)
+
+
+class RoomDepth:
+    """`MetricDepth` of the exact room in some unit, by a network that takes the focal length into account.
+
+    Attributes:
+        shown: Frame and focal length of every picture so far.
+    """
+
+    depth_kind: DepthKind = "z"
+    shared_sigma_ratio = 0.05
+
+    def __init__(self, refiner: RoomRefiner, unit: float = 3.0) -> None:
+        self._refiner, self._unit = refiner, unit
+        self.shown: list[tuple[int, float]] = []
+
+    def input_size(self, width: int, height: int) -> tuple[int, int]:
+        return width, height
+
+    def estimate(self, rgb: NDArray[np.uint8], camera: Camera) -> MetricEstimate:
+        index = int(rgb[0, 0, 0])
+        self.shown.append((index, camera.focal_px))
+        inverse_depth = self._refiner.inverse_depth[index].reshape(GRID.height, GRID.width)
+        shape = (camera.height // 8, camera.width // 8)
+        assert inverse_depth.shape == shape
+        depth_m = self._unit * camera.focal_px / self._refiner.camera.focal_px / inverse_depth
+        return MetricEstimate(depth_m.astype(np.float32), np.ones(shape, np.float32))
 
 
 class _Refinement:
@@ -127,6 +170,7 @@ class _Refinement:
         exact = [owner.exact(i, j) for i, j in self._pairs]
         true = np.stack([px for px, _ in exact])
         weight = np.repeat(np.stack([visible for _, visible in exact])[..., None], 2, axis=2)
+        weight[:, GRID.num_cells - owner.blind_cells :] = False
         start = np.where(np.isfinite(seen), seen, GRID.sample_px().numpy())
         target = start + owner.share * (true - start) + rng.normal(0, owner.noise_px, true.shape)
         damping = torch.full((len(set(sources)), GRID.num_cells), owner.damping)

@@ -8,11 +8,13 @@ import exact_room
 import numpy as np
 import pytest
 import torch
-from exact_refiner import GRID, RoomRefiner
+from exact_refiner import GRID, RoomDepth, RoomRefiner
 from numpy.typing import NDArray
 
+from vipe_core.cameras.calibration import Calibration
 from vipe_core.geometry import umeyama
 from vipe_core.geometry.arrays import inverse
+from vipe_core.priors.protocols import MetricDepth
 from vipe_core.slam.adjustment import Adjuster, FocalPrior
 from vipe_core.slam.graph import Graph
 from vipe_core.slam.keyframes import KeyframeMap
@@ -35,9 +37,15 @@ def walk(count: int) -> NDArray[np.float64]:
     )
 
 
-def run(refiner: RoomRefiner, fov_deg: float, sigma: float, schedule: RefinementSettings = SHORT) -> SlamResult:
+def run(
+    refiner: RoomRefiner,
+    fov_deg: float,
+    sigma: float,
+    schedule: RefinementSettings = SHORT,
+    metric: MetricDepth | None = None,
+) -> SlamResult:
     settings = SlamSettings(refinement=schedule)
-    return Slam(refiner.priors(fov_deg, sigma), settings, torch.device("cpu")).run(refiner, lambda *_: None)
+    return Slam(refiner.priors(fov_deg, sigma, metric), settings, torch.device("cpu")).run(refiner, lambda *_: None)
 
 
 def position_error(result: SlamResult, refiner: RoomRefiner) -> float:
@@ -152,3 +160,42 @@ def test_links_are_to_neighbours_and_to_the_nearest_others_at_a_distance_from_ea
     assert (distances(refiner.reprojector, keyframes, far, settings) <= 20.0).all()
     again = links(refiner.reprojector, keyframes, everyone, everyone, found, Reach(3, 20.0, 2, 400), settings)
     assert not again
+
+
+def depth_error(result: SlamResult, refiner: RoomRefiner) -> float:
+    """Mean error of the logarithm of the inverse depths of all cells, in one scale for all of them."""
+    truth = np.stack([refiner.inverse_depth[index] for index in result.keyframes])
+    error = np.log(result.inverse_depth / truth)
+    return float(np.abs(error - np.median(error)).mean())
+
+
+def test_metric_depth_tells_the_shape_of_what_the_network_cannot_see_and_is_asked_anew_once() -> None:
+    """Half of every picture has no weight: only the prior knows how far away it is."""
+    short = replace(SHORT, global_updates=(1, 1, 6), first_updates=4)
+    poses = walk(16)
+    blind = RoomRefiner(poses, blind_cells=GRID.num_cells // 2)
+    without = run(blind, 68.0, 1.0, short)
+    blind = RoomRefiner(poses, blind_cells=GRID.num_cells // 2)
+    metric = RoomDepth(blind)
+    found = run(blind, 68.0, 1.0, short, metric)
+    assert depth_error(without, blind) > 0.08
+    assert depth_error(found, blind) < 0.01
+    assert position_error(found, blind) < 5e-3
+    # Every keyframe is shown twice, the second time with the camera as it was found, which is held from then on.
+    frames = [index for index, _ in metric.shown]
+    assert all(frames.count(index) == 2 for index in found.keyframes)
+    again = metric.shown[-len(found.keyframes) :]
+    assert again == [(index, found.camera.focal_px) for index in found.keyframes]
+
+
+def test_metric_depth_is_asked_once_where_the_camera_is_known() -> None:
+    refiner = RoomRefiner(walk(16))
+    metric = RoomDepth(refiner)
+    short = replace(SHORT, global_updates=(1, 1, 2), first_updates=2)
+    settings = SlamSettings(refinement=short)
+    known = Calibration(refiner.camera)
+    slam = Slam(refiner.priors(60.0, 1.0, metric), settings, torch.device("cpu"))
+    found = slam.run(refiner, lambda *_: None, known)
+    assert found.camera.focal_px == pytest.approx(refiner.camera.focal_px, rel=1e-9)
+    frames = [index for index, _ in metric.shown]
+    assert len(set(frames)) == len(frames) >= len(found.keyframes)

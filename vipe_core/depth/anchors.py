@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 
 from vipe_core.annotation import DepthKind
 from vipe_core.cameras import Camera
+from vipe_core.cameras.along import inverse_along
 from vipe_core.depth.alignment import Samples
 from vipe_core.depth.projection import MapProjector, ProjectedMap
-from vipe_core.depth.scale import inverse_along
 from vipe_core.depth.types import SceneMap
 from vipe_core.priors.protocols import DepthFamily
 from vipe_core.slam.segmentation import MOVING

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vipe_core.annotation import DepthKind
-from vipe_core.cameras import Camera
+from vipe_core.cameras.along import inverse_along
 from vipe_core.depth.robust import consensus, weighted_median, weighted_spread
 from vipe_core.depth.types import SceneMap
 from vipe_core.errors import ScaleUnobservable
@@ -174,25 +174,6 @@ def ratio_to_prior(
     values = np.log(depth_m[use] * scene.inverse_depth[number][use] * along[use])
     value = weighted_median(values, weight[use])
     return FrameRatio(value, weighted_spread(values, weight[use], value), float(weight[use].sum()) / cells.size)
-
-
-def inverse_along(camera: Camera, kind: DepthKind) -> NDArray[np.float64]:
-    """(h, w) what turns inverse depth along the camera's rays into inverse depth of a kind, by multiplication.
-
-    0 where the pixel has no depth of that kind: z behind a wide lens.
-    """
-    if kind == "ray":
-        if camera.model != "pinhole":
-            return np.ones((camera.height, camera.width))
-        return np.asarray(1 / np.linalg.norm(camera.rays(), axis=-1))
-    if camera.model == "pinhole":
-        return np.ones((camera.height, camera.width))
-    forward = camera.rays()[..., 2]
-    return np.where(forward > _MIN_FORWARD, 1 / np.maximum(forward, _MIN_FORWARD), 0.0)
-
-
-# Directions closer to the plane of the lens than some 3 degrees have no useful z.
-_MIN_FORWARD = 0.05
 
 
 def scale_from_path(scene: SceneMap, path_m: float) -> ScaleEstimate:

@@ -48,6 +48,7 @@ from vipe_core.pipeline.provenance import engine_version, library_versions
 from vipe_core.pipeline.providers import open_depth, open_masks, open_priors, require_libraries
 from vipe_core.pipeline.scaling import ScaledScene, set_scale
 from vipe_core.priors.classical.panoramic import looks_panoramic
+from vipe_core.priors.protocols import PriorFamily
 from vipe_core.priors.weights import require_all
 from vipe_core.quality import assess
 from vipe_core.slam.panorama import PanoramaSlam
@@ -167,7 +168,7 @@ class Annotator:
             if given is None:
                 result = self._slam(self._model(source), budget).run(source, report)
             else:
-                slam = Slam(self._priors(), self.preset.slam, self.device, budget.fit)
+                slam = Slam(self._family(), self.preset.slam, self.device, budget.fit)
                 result = slam.run(source, report, camera_to_solve(given, source))
             clock = self._clock(result, clock)
             quality = assess(result, self.preset.slam, source.info.width)
@@ -208,6 +209,11 @@ class Annotator:
         with closing(source.frames(stop=_PICTURES_LOOKED_AT)) as frames:
             return "equirect" if looks_panoramic([frame.rgb for frame in frames]) else "auto"
 
+    def _family(self) -> PriorFamily:
+        """The priors of one video: metric depth is one of the map where measurements are refined with it."""
+        priors = self._priors()
+        return priors if priors.refiner is None else dataclasses.replace(priors, metric=self._depth.metric)
+
     def release(self) -> None:
         """Give back what is kept of the GPU for the next video, so that others on it may take it."""
         release_memory(self.device)
@@ -229,7 +235,7 @@ class Annotator:
         return clock
 
     def _slam(self, model: str, budget: MemoryBudget) -> Slam | PanoramaSlam:
-        priors = self._priors()
+        priors = self._family()
         if model != "equirect":
             return Slam(priors, self.preset.slam, self.device, budget.fit)
         if priors.refiner is not None:

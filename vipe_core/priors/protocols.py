@@ -152,6 +152,9 @@ class Refiner(Protocol):
     @property
     def offset_px(self) -> float: ...
 
+    def picture(self, features: Any) -> NDArray[np.uint8]:
+        """(h, w, 3) the working picture behind features of `DenseMatcher.encode`."""
+
     def begin(self, grid: Grid, *, lean: bool, spilled: bool = False) -> Refinement:
         """A refinement without edges.
 
@@ -254,6 +257,7 @@ class PriorFamily:
         aligner: Measurements near the finished geometry, or None for a family whose dense matching is as good.
         refiner: Measurements refined in turns with the geometry, which then replaces pairwise matching in the map; None
             for a family that measures each pair once.
+        metric: Metric depth as a prior of the map, with a refiner; None without.
     """
 
     matcher: DenseMatcher
@@ -262,6 +266,7 @@ class PriorFamily:
     intrinsics: IntrinsicsInit
     aligner: Aligner | None = None
     refiner: Refiner | None = None
+    metric: MetricDepth | None = None
 
 
 class VideoDepth(Protocol):

@@ -24,6 +24,7 @@ from vipe_core.slam.keyframes import KeyframeMap
 from vipe_core.slam.masks import MotionMasks
 from vipe_core.slam.measuring import MeasuredGraph
 from vipe_core.slam.recurrent.backend import RefinedBackend
+from vipe_core.slam.recurrent.depth_prior import DepthPrior
 from vipe_core.slam.recurrent.tracking import RefinedTracker
 from vipe_core.slam.reprojection import Reprojector
 from vipe_core.slam.rotation import Link, RotationFitter
@@ -218,8 +219,10 @@ class ShotMapper:
         settings, reprojector, refiner = self._settings, self.reprojector, self._priors.refiner
         keyframes, graph, adjuster = bare.keyframes, bare.graph, bare.adjuster
         schedule, scale_px = settings.refinement, settings.scaled_px(1.0, self._size.width)
-        tracker = RefinedTracker(refiner, keyframes, adjuster, reprojector, schedule, scale_px)
-        backend = RefinedBackend(refiner, keyframes, graph, adjuster, reprojector, schedule, scale_px)
+        metric = self._priors.metric if settings.terms.depth_prior else None
+        prior = None if metric is None else DepthPrior(metric, refiner, keyframes)
+        tracker = RefinedTracker(refiner, keyframes, adjuster, reprojector, schedule, scale_px, prior)
+        backend = RefinedBackend(refiner, keyframes, graph, adjuster, reprojector, schedule, scale_px, prior)
         on_the_way, again, finally_ = schedule.global_updates
         with self._clock("track"):
             first = min(len(chosen), settings.min_keyframes)
@@ -239,7 +242,7 @@ class ShotMapper:
             adjusting()
             backend.run(again)
             before = keyframes.snapshot()
-            backend.run(finally_)
+            backend.run(finally_, settle=True)
             adjuster.alive = _nothing
             loops = examine_loops(reprojector, keyframes, graph, before, schedule.neighbours)
             bare.masks.update(range(len(keyframes)))

@@ -82,6 +82,10 @@ class DroidMatcher:
         """One-way measurement; what the network is sure of counts as consistent."""
         return self._flow([(source, target)], [guess_px], _FAST_UPDATES)[0]
 
+    def picture(self, features: DroidFeatures) -> NDArray[np.uint8]:
+        """See `Refiner.picture`."""
+        return features.rgb
+
     def begin(self, grid: Grid, *, lean: bool, spilled: bool = False) -> DroidRefinement:
         """See `Refiner.begin`."""
         return DroidRefinement(self._network, grid, lean=lean, spilled=spilled)

@@ -11,6 +11,7 @@ from vipe_core.slam.adjustment import Adjuster
 from vipe_core.slam.graph import Graph
 from vipe_core.slam.keyframes import KeyframeMap
 from vipe_core.slam.lens import focal_sigma_ratio, plausible
+from vipe_core.slam.recurrent.depth_prior import DepthPrior
 from vipe_core.slam.recurrent.edges import RefinedEdges
 from vipe_core.slam.recurrent.linking import Reach, links
 from vipe_core.slam.recurrent.settings import RefinementSettings
@@ -36,6 +37,7 @@ class RefinedBackend:
         reprojector: Reprojector,
         settings: RefinementSettings,
         scale_px: float,
+        prior: DepthPrior | None = None,
     ) -> None:
         self._refiner = refiner
         self._keyframes = keyframes
@@ -43,11 +45,17 @@ class RefinedBackend:
         self._adjuster = adjuster
         self._reprojector = reprojector
         self._settings = settings
+        self._prior = prior
         self._max_px = scale_px * settings.global_px
         self.focal_sigma_ratio = adjuster.focal_prior.sigma
 
-    def run(self, updates: int) -> None:
-        """Link, update and adjust everything from scratch; renormalise the scale to median depth 1."""
+    def run(self, updates: int, *, settle: bool = False) -> None:
+        """Link, update and adjust everything from scratch; renormalise the scale to median depth 1.
+
+        Args:
+            settle: Where there is a prior of depths, which depends on the camera: after half of the updates it is
+                asked anew, once, and the camera is held from then on.
+        """
         count = len(self._keyframes)
         if count < 2:
             return
@@ -55,11 +63,26 @@ class RefinedBackend:
         most = min(settings.global_edges * count, settings.global_most_edges)
         reach = Reach(settings.neighbours, self._max_px, settings.global_gap, most)
         found = links(self._reprojector, self._keyframes, range(count), range(count), (), reach, settings)
-        edges = RefinedEdges(self._refiner, self._keyframes, self._adjuster, lean=True, spilled=settings.lean)
+        prior = self._prior
+        edges = RefinedEdges(
+            self._refiner,
+            self._keyframes,
+            self._adjuster,
+            lean=True,
+            spilled=settings.lean,
+            prior=prior,
+            prior_information=settings.metric_information,
+        )
         edges.add(found)
-        for _ in range(updates):
+        settled = updates if prior is None or not settle or self._adjuster.focal_prior.held else updates // 2
+        for update in range(updates):
+            if prior is not None and update == settled:
+                prior.refresh()
             edges.update()
-            self._adjust(edges)
+            if update < settled:
+                self._adjust(edges)
+            else:
+                edges.adjust(1, settings.global_iterations)
         for edge in list(self._graph):
             self._graph.discard(*edge)
         edges.file(self._graph)
@@ -69,8 +92,8 @@ class RefinedBackend:
         """Adjust with free intrinsics; take that back when the focal length runs out of any lens's range."""
         before = self._keyframes.snapshot()
         result = edges.adjust(1, self._settings.global_iterations, free_focal=True)
-        if result is None:
-            return None
+        if result is None or self._adjuster.focal_prior.held:
+            return result
         settings, camera = self._adjuster.settings, self._keyframes.camera
         formal = focal_sigma_ratio(camera, result.intrinsics_covariance)
         sigma = math.hypot(settings.focal_sigma_inflation * formal, settings.lens_sigma)

@@ -14,6 +14,7 @@ from vipe_core.priors.protocols import Match, Refined, Refiner
 from vipe_core.slam.adjustment import Adjuster, Step
 from vipe_core.slam.graph import Graph
 from vipe_core.slam.keyframes import KeyframeMap
+from vipe_core.slam.recurrent.depth_prior import DepthPrior
 
 Pair = tuple[int, int]
 
@@ -26,6 +27,8 @@ class RefinedEdges:
 
     Args:
         lean, spilled: See `Refiner.begin`.
+        prior: Of inverse depths; None where nothing is known of them.
+        prior_information: Of it, in units of the map's median.
 
     Attributes:
         active: Edges that are refined, in the order of their rows.
@@ -33,10 +36,19 @@ class RefinedEdges:
     """
 
     def __init__(
-        self, refiner: Refiner, keyframes: KeyframeMap, adjuster: Adjuster, *, lean: bool, spilled: bool = False
+        self,
+        refiner: Refiner,
+        keyframes: KeyframeMap,
+        adjuster: Adjuster,
+        *,
+        lean: bool,
+        spilled: bool = False,
+        prior: DepthPrior | None = None,
+        prior_information: float = 0.0,
     ) -> None:
         self._keyframes = keyframes
         self._adjuster = adjuster
+        self._prior, self._prior_information = prior, prior_information
         self._refinement = refiner.begin(keyframes.grid, lean=lean, spilled=spilled)
         self.active: list[Pair] = []
         self.stored: dict[Pair, tuple[Tensor, Tensor]] = {}
@@ -111,6 +123,8 @@ class RefinedEdges:
             said = [self.stored[edge] for edge in again]
             measured.append((torch.stack([px for px, _ in said]), torch.stack([weight for _, weight in said])))
         settings, prior = self._adjuster.settings, self._adjuster.focal_prior
+        free_focal = free_focal and not prior.held
+        expected, information = self._expected(frames, state)
         problem = Problem(
             camera_model=self._keyframes.camera_model,
             grid=self._keyframes.grid,
@@ -127,8 +141,8 @@ class RefinedEdges:
                 distortion=free_focal and not prior.same_lens,
             ),
             priors=Priors(
-                inverse_depth=state.inverse_depth,
-                inverse_depth_weight=self._information(frames, state),
+                inverse_depth=expected,
+                inverse_depth_weight=information,
                 log_focal=prior.log_focal if free_focal else None,
                 log_focal_sigma=prior.sigma / settings.focal_sigma_inflation,
             ),
@@ -164,12 +178,18 @@ class RefinedEdges:
         for (i, j), target_px, weight in zip(self.active, targets, weights, strict=True):
             graph.add(i, j, Match(target_px, weight, float((weight.max(axis=1) > 0.5).mean())))
 
-    def _information(self, frames: Sequence[int], state: State) -> Tensor:
-        """(F, P) information on staying put, of inverse depths in the unit of the map."""
+    def _expected(self, frames: Sequence[int], state: State) -> tuple[Tensor, Tensor]:
+        """(F, P) each: inverse depths to keep to, and the information on them: where they are, and what is known."""
         median = state.inverse_depth.median().clamp(min=1e-6)
         unknown = torch.zeros_like(state.inverse_depth[0])
         each = torch.stack([self._damping.get(k, unknown) for k in frames]).to(state.inverse_depth)
-        return (each + _LEAST_DAMPING) / median**2
+        staying = (each + _LEAST_DAMPING) / median**2
+        if self._prior is None:
+            return state.inverse_depth, staying
+        said = torch.from_numpy(self._prior.inverse_depths(frames)).to(state.inverse_depth)
+        known = (said > 0) * (self._prior_information / median**2)
+        information = staying + known
+        return (staying * state.inverse_depth + known * said) / information, information
 
     def _state(self, frames: Sequence[int]) -> State:
         keyframes = self._keyframes

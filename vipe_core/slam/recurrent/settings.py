@@ -37,6 +37,8 @@ class RefinementSettings:
         global_updates: Updates of a global adjustment on the way, of the first and of the second at the end.
         global_iterations: Gauss-Newton steps after each of these updates.
         fill_updates: Updates of the frames between keyframes.
+        metric_information: Information of metric depth, where there is any, on an inverse depth in units of the map's
+            median: the paper's 0.001 per (1/m)^2, beside 0.001 per squared cell, for a median depth of 3 m.
         lean: The low-memory profile: the window and the frames between keyframes, too, go without volumes of
             correlation, and the states of whole graphs lie on the host; see `Refiner.begin`.
     """
@@ -64,4 +66,5 @@ class RefinementSettings:
     global_updates: tuple[int, int, int] = (5, 7, 24)
     global_iterations: int = 8
     fill_updates: int = 10
+    metric_information: float = 7.0
     lean: bool = False

@@ -10,6 +10,7 @@ from vipe_core.geometry.arrays import interpolate_trajectory
 from vipe_core.priors.protocols import Refiner
 from vipe_core.slam.adjustment import Adjuster
 from vipe_core.slam.keyframes import KeyframeMap
+from vipe_core.slam.recurrent.depth_prior import DepthPrior
 from vipe_core.slam.recurrent.edges import RefinedEdges
 from vipe_core.slam.recurrent.linking import Reach, distances, links
 from vipe_core.slam.recurrent.settings import RefinementSettings
@@ -26,6 +27,7 @@ class RefinedTracker:
 
     Args:
         scale_px: Working pixels per pixel of an image that is 640 wide.
+        prior: Of inverse depths; None where nothing is known of them.
     """
 
     def __init__(
@@ -36,6 +38,7 @@ class RefinedTracker:
         reprojector: Reprojector,
         settings: RefinementSettings,
         scale_px: float,
+        prior: DepthPrior | None = None,
     ) -> None:
         self._keyframes = keyframes
         self._reprojector = reprojector
@@ -44,12 +47,24 @@ class RefinedTracker:
         self._reach = Reach(
             settings.neighbours, scale_px * settings.window_px, settings.window_gap, settings.window_edges
         )
-        self._edges = RefinedEdges(refiner, keyframes, adjuster, lean=settings.lean)
+        self._prior = prior
+        self._edges = RefinedEdges(
+            refiner,
+            keyframes,
+            adjuster,
+            lean=settings.lean,
+            prior=prior,
+            prior_information=settings.metric_information,
+        )
 
     def start(self, first: Sequence[Keyframe], times_s: Sequence[float]) -> None:
-        """Fill the empty map with the first keyframes, from a flat scene that stands still."""
+        """Fill the empty map with the first keyframes, which stand still; the scene is flat unless a prior knows it."""
         for keyframe, time_s in zip(first, times_s, strict=True):
             self._keyframes.append(keyframe, time_s, np.eye(4), np.ones(self._keyframes.grid.num_cells))
+        if self._prior is not None:
+            for k, depth in enumerate(self._prior.expected(range(len(first)))):
+                self._keyframes.set_depth(k, depth)
+            self._keyframes.normalise_scale()
         if len(first) < 2:
             return
         settings = self._settings
@@ -77,6 +92,8 @@ class RefinedTracker:
         mean = float(np.mean([keyframes.depth(k) for k in last]))
         keyframes.append(keyframe, time_s, expected, np.full(keyframes.grid.num_cells, mean))
         count = len(keyframes)
+        if self._prior is not None:
+            keyframes.set_depth(count - 1, self._prior.expected([count - 1])[0])
         self._edges.retire(settings.oldest)
         self._link(range(max(count - settings.recent, 0), count), range(max(count - settings.window, 0), count))
         self._refine(settings.updates)
