@@ -1,38 +1,59 @@
 """Everything that only a GPU can prove, in one call of less than ten minutes: `python -m benchmarks.gpu_checks`.
 
-    compile     the kernels of bundle adjustment are compiled for this GPU and loaded
+    compile     every kernel of bundle adjustment is compiled for this GPU, several at a time, and one is loaded
     correct     CUDA kernels against the float64 oracle, the torch solver and the compiled loops, on many shapes
     same bits   20 solves are bitwise equal, with another stream busy
     graph       a captured solve, replayed on other numbers, is bitwise the one launched kernel by kernel
-    one wait    a solve makes the host wait for the GPU once, at its end
+    one wait    a solve makes the host wait for the GPU nowhere but where its answer is read; what a launch costs
     memcheck, racecheck, initcheck   compute-sanitizer on small solves, where it is installed
-    ba          `python -m benchmarks.ba`
     network     the DROID network against itself on the CPU; its kernels and graphs against their absence
+    ba          `python -m benchmarks.ba`
     pipeline    `python -m benchmarks.gpu_pipeline`, with short clips
 
-Every section runs in a process of its own under a time limit and survives the failure of another. Without a GPU it says
-so and does nothing. `--vipe FOLDER` is handed to `benchmarks.ba`.
+Every section runs in a process of its own under a time limit and survives the failure of another; those that measure no
+time run side by side. What they print is in `--output FOLDER`, its end on the terminal, a summary last. Without a GPU
+it says so and does nothing. `--vipe FOLDER` and `--droid FOLDER` are handed to `benchmarks.ba`.
 """
 
 from __future__ import annotations
 
 import argparse
+import multiprocessing
 import os
 import shutil
+import signal
 import subprocess
 import sys
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from itertools import repeat
 from pathlib import Path
 from typing import Any
 
 import torch
-from rich.console import Console
-from rich.table import Table
 
-from benchmarks.ba import Size, problem_of
-from vipe_core.ba import Edges, Free, Options, Priors, Problem, Result, State, cuda, newton_step, oracle, solve
+from benchmarks.ba import Size, placed, problem_of
+from vipe_core.ba import (
+    Edges,
+    Free,
+    Grid,
+    Options,
+    Priors,
+    Problem,
+    Result,
+    Rig,
+    State,
+    cuda,
+    newton_step,
+    oracle,
+    reproject,
+    solve,
+)
+from vipe_core.ba.answer import result_of
+from vipe_core.ba.cuda.compiler import cache_folder, compile_kernels, specialisations, system_source, tile_source
+from vipe_core.ba.cuda.solver import Adjustment
 from vipe_core.ba.problem import RobustKernel
 from vipe_core.geometry import se3
 
@@ -47,22 +68,24 @@ def _device() -> torch.device:
 
 
 def _moved(problem: Problem, state: State, device: torch.device) -> tuple[Problem, State]:
-    edges, priors, free = problem.edges, problem.priors, problem.free
-    edges = Edges(*(x.to(device) for x in (edges.source, edges.target, edges.target_px.float(), edges.weight.float())))
+    """In single precision on a device, but for the graph."""
+    edges, priors = problem.edges, problem.priors
     prior = priors.inverse_depth, priors.inverse_depth_weight
-    priors = replace(
-        priors,
-        inverse_depth=None if prior[0] is None else prior[0].float().to(device),
-        inverse_depth_weight=None if prior[1] is None else prior[1].float().to(device),
+    problem = replace(
+        problem,
+        edges=replace(edges, target_px=edges.target_px.float(), weight=edges.weight.float()),
+        priors=replace(
+            priors,
+            inverse_depth=None if prior[0] is None else prior[0].float().to(device),
+            inverse_depth_weight=None if prior[1] is None else prior[1].float().to(device),
+        ),
     )
-    state = State(state.cam_from_world.to(device), state.inverse_depth.float().to(device), state.intrinsics.to(device))
-    return replace(problem, edges=edges, priors=priors, free=free), state
+    there, moved = placed(problem, replace(state, inverse_depth=state.inverse_depth.float()), device)
+    return there, replace(moved, cam_from_rig=None if state.cam_from_rig is None else state.cam_from_rig.to(device))
 
 
 def _scene(frames: int, cells: tuple[int, int], unified: bool, focal: bool, reach: int) -> tuple[Problem, State]:
     """A small problem in double precision on the host, and where to start."""
-    from vipe_core.ba import Grid, reproject
-
     rng = torch.Generator().manual_seed(frames)
     grid = Grid(*cells)
     length = 0.9 * grid.width * grid.stride
@@ -92,8 +115,34 @@ def _scene(frames: int, cells: tuple[int, int], unified: bool, focal: bool, reac
     return problem, State(moved @ truth.cam_from_world, depth * 1.02, truth.intrinsics)
 
 
+def _rig_scene(focal: bool) -> tuple[Problem, State]:
+    """Three cameras on a rig that moves, its extrinsics free under a prior; each with intrinsics of its own, or the
+    focal length of all free."""
+    problem, start = _scene(12, (6, 11), False, focal, 4)
+    rig = Rig(torch.arange(12) // 3, torch.arange(12) % 3)
+    rng = torch.Generator().manual_seed(1)
+    cam_from_rig = se3.exp(0.02 * torch.randn(3, 6, generator=rng, dtype=torch.float64))
+    rig_from_world = start.cam_from_world[3 * rig.pose_of_frame]
+    intrinsics = start.intrinsics if focal else start.intrinsics * torch.tensor([[1.0], [1.02], [0.99]])
+    truth = State(cam_from_rig[rig.view_of_frame] @ rig_from_world, start.inverse_depth, intrinsics, cam_from_rig)
+    edges = problem.edges
+    target_px, valid = reproject("pinhole", problem.grid, truth, edges.source, edges.target, rig=rig)
+    target_px += 0.3 * torch.randn(target_px.shape, generator=rng, dtype=torch.float64)
+    free = replace(problem.free, poses=rig.pose_of_frame >= 1, extrinsics=True)
+    problem = replace(
+        problem,
+        edges=replace(edges, target_px=target_px, weight=edges.weight * valid[..., None]),
+        free=free,
+        priors=replace(problem.priors, cam_from_rig=cam_from_rig, extrinsic_sigma=(0.1, 0.1)),
+        rig=rig,
+    )
+    away = se3.exp(0.005 * torch.randn(4, 6, generator=rng, dtype=torch.float64))[rig.pose_of_frame]
+    moved = torch.where(free.poses[:, None, None], away @ rig_from_world, rig_from_world)
+    return problem, replace(truth, cam_from_world=cam_from_rig[rig.view_of_frame] @ moved)
+
+
 def _shapes() -> list[tuple[Problem, State, RobustKernel]]:
-    """Both cameras, all sets of intrinsics and kernels, cells that do not fill a tile, a frame with many edges."""
+    """Both cameras, all sets of intrinsics and kernels, odd numbers of cells, a frame with many edges, rigs."""
     kernels: tuple[RobustKernel, ...] = ("none", "huber", "cauchy", "geman_mcclure", "tukey")
     shapes = [(4, (5, 13), 2), (6, (9, 15), 3), (9, (16, 20), 4), (3, (1, 7), 2), (27, (3, 5), 26)]
     found: list[tuple[Problem, State, RobustKernel]] = []
@@ -102,7 +151,7 @@ def _shapes() -> list[tuple[Problem, State, RobustKernel]]:
             for focal in (False, True):
                 problem, start = _scene(frames, cells, unified, focal, reach)
                 found.append((problem, start, kernels[(k + 2 * unified + focal) % 5]))
-    return found
+    return [*found, (*_rig_scene(False), "none"), (*_rig_scene(True), "geman_mcclure")]
 
 
 def _same(first: Result, second: Result) -> bool:
@@ -115,18 +164,29 @@ def _tensors(state: State) -> tuple[torch.Tensor, ...]:
 
 
 def _kernels(problem: Problem, state: State, options: Options) -> Result:
-    result = cuda.solve(problem, state, options)
-    if result is None:
+    answer = cuda.solve(problem, state, options)
+    if answer is None:
         raise RuntimeError("the kernels cannot be compiled or loaded")
-    return result
+    return result_of(answer, state)
+
+
+def _compile(source: str, architecture: str) -> None:
+    compile_kernels(source, architecture, cache=cache_folder())
 
 
 def check_compile() -> str:
     start = time.perf_counter()
+    sources = [system_source(), *(tile_source([kind]) for kind in specialisations())]
+    major, minor = torch.cuda.get_device_capability()
+    # A forked process could not use the driver; these do not need it.
+    fresh = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(min(len(os.sched_getaffinity(0)), 12), fresh) as pool:
+        list(pool.map(_compile, sources, repeat(f"sm_{major}{minor}")))
+    compiled_s = time.perf_counter() - start
     problem, state = _moved(*_scene(4, (5, 13), False, True, 2), _device())
     if cuda.prepare(problem, state, Options()) is None:
-        raise RuntimeError("the kernels cannot be compiled or loaded")
-    return f"{time.perf_counter() - start:.1f} s to compile or load"
+        raise RuntimeError("the kernels cannot be loaded")
+    return f"{len(sources)} sources compiled or found in {compiled_s:.1f} s"
 
 
 def check_correct() -> str:
@@ -139,9 +199,13 @@ def check_correct() -> str:
             step = oracle.newton_step(problem, start, options, options.initial_damping)
         else:
             step = newton_step(problem, start, options, options.initial_damping)
+        pose, extrinsic = step.pose, step.extrinsic
+        if problem.rig is not None and extrinsic is not None:
+            views = se3.exp(extrinsic)[problem.rig.view_of_frame]
+            pose = se3.log(views @ se3.exp(pose))
         moved = se3.log(found.state.cam_from_world.cpu() @ se3.inverse(start.cam_from_world))
         change = found.state.inverse_depth.cpu().double() - start.inverse_depth
-        worst["pose"] = max(worst["pose"], float((moved - step.pose).norm() / step.pose.norm()))
+        worst["pose"] = max(worst["pose"], float((moved - pose).norm() / pose.norm()))
         worst["depth"] = max(worst["depth"], float((change - step.inverse_depth).norm() / step.inverse_depth.norm()))
         longer = replace(options, max_iterations=8)
         found, expected = _kernels(*here, longer), solve(*_moved(problem, start, torch.device("cpu")), longer)
@@ -166,40 +230,61 @@ def check_same_bits() -> str:
     return f"{_RUNS} solves bitwise equal"
 
 
-def check_graph() -> str:
-    problem, state = problem_of(Size(25, 120, focal=True), _device())
-    options = Options(max_iterations=4)
+def _prepared(problem: Problem, state: State, options: Options) -> Adjustment:
     adjustment = cuda.prepare(problem, state, options)
     if adjustment is None:
         raise RuntimeError("the kernels cannot be compiled or loaded")
+    return adjustment
+
+
+def check_graph() -> str:
+    problem, state = problem_of(Size(25, 120, focal=True), _device())
+    options = Options(max_iterations=4)
+    adjustment = _prepared(problem, state, options)
     adjustment.run()
-    eager = adjustment.result()
     graph = torch.cuda.CUDAGraph()
     with torch.cuda.graph(graph):
         adjustment.run()
     for scale in (1.0, 0.5):
         problem.edges.weight.mul_(scale)
         graph.replay()
-        replayed = adjustment.result()
-        eager = _kernels(problem, state, options)
-        if not _same(replayed, eager):
+        replayed = result_of(adjustment.answer(), state)
+        launched = _kernels(problem, state, options)
+        if not _same(replayed, launched):
             raise AssertionError("a replayed solve differs from a launched one")
-    return f"replay equals launches, {eager.status}"
+    return f"replay equals launches, {launched.status}"
 
 
 def check_one_wait() -> str:
     problem, state = problem_of(Size(25, 120, focal=True), _device())
-    adjustment = cuda.prepare(problem, state, Options())
-    if adjustment is None:
-        raise RuntimeError("the kernels cannot be compiled or loaded")
-    adjustment.run()
-    adjustment.result()
+    options = Options(max_iterations=2)
+    solve(problem, state, options)
+    torch.cuda.synchronize()
     torch.cuda.set_sync_debug_mode("error")
     try:
-        adjustment.run()
+        start = time.perf_counter()
+        answer = cuda.solve(problem, state, options)
+        launched_s = time.perf_counter() - start
     finally:
         torch.cuda.set_sync_debug_mode("default")
-    return f"{adjustment.result().iterations} steps without a wait"
+    if answer is None:
+        raise RuntimeError("the kernels cannot be compiled or loaded")
+    result = result_of(answer, state)
+    adjustment = _prepared(problem, state, options)
+    new_event: Any = torch.cuda.Event  # without types
+    starts = [new_event(enable_timing=True) for _ in range(2)]
+    adjustment.run()
+    torch.cuda.synchronize()
+    start = time.perf_counter()
+    starts[0].record()
+    adjustment.run()
+    starts[1].record()
+    run_s = time.perf_counter() - start
+    torch.cuda.synchronize()
+    return (
+        f"{result.iterations} steps without a wait; prepared and launched in {1e3 * launched_s:.2f} ms, launched alone "
+        f"in {1e3 * run_s:.2f} ms, {starts[0].elapsed_time(starts[1]):.2f} ms on the GPU"
+    )
 
 
 def check_small_solves() -> str:
@@ -219,30 +304,97 @@ CHECKS: dict[str, Callable[[], str]] = {
 }
 
 
-def _sections(vipe: Path | None) -> list[tuple[str, list[str], float]]:
-    """Name, command and seconds of every section; together they stay below ten minutes."""
+@dataclass(frozen=True, slots=True)
+class Section:
+    """A command, the seconds it may take, and how much of what it says is shown when it passed."""
+
+    name: str
+    command: list[str]
+    limit_s: float
+    shown: int = 200
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """How a section ended."""
+
+    name: str
+    outcome: str
+    seconds: float
+    said: str
+    shown: int
+
+    @property
+    def passed(self) -> bool:
+        return self.outcome == "passed"
+
+
+def _sections(vipe: Path | None, droid: Path | None) -> list[list[Section]]:
+    """Groups of sections, one after the other; those of a group run side by side."""
     this = [sys.executable, "-m", "benchmarks.gpu_checks", "--check"]
-    sections: list[tuple[str, list[str], float]] = [
-        ("compile", [*this, "compile"], 60),
-        ("correct", [*this, "correct"], 90),
-        ("same bits", [*this, "same-bits"], 40),
-        ("graph", [*this, "graph"], 40),
-        ("one wait", [*this, "one-wait"], 40),
+    # The settings of this project name plugins that a bare machine need not have.
+    tests = [sys.executable, "-m", "pytest", "-q", "-c", os.devnull, "--rootdir", "."]
+    beside = [
+        Section("correct", [*this, "correct"], 150),
+        Section("same bits", [*this, "same-bits"], 60),
+        Section("graph", [*this, "graph"], 60),
+        Section("network", [*tests, "tests/priors/test_droid_gpu.py"], 150),
     ]
     sanitizer = next(filter(None, map(shutil.which, _SANITIZER)), None)
     for tool in ("memcheck", "racecheck", "initcheck") if sanitizer else ():
         watched = [str(sanitizer), "--tool", tool, "--error-exitcode", "9", *this, "small-solves"]
-        sections.append((tool, watched, 60))
-    peer = ["--vipe", str(vipe)] if vipe else []
-    sections.append(("ba", [sys.executable, "-m", "benchmarks.ba", *peer], 90))
-    sections.append(("network", [sys.executable, "-m", "pytest", "-q", "tests/priors/test_droid_gpu.py"], 45))
-    sections.append(("pipeline", [sys.executable, "-m", "benchmarks.gpu_pipeline", "--frames", "90"], 75))
-    return sections
+        beside.append(Section(tool, watched, 150))
+    peers = [*(["--vipe", str(vipe)] if vipe else []), *(["--droid", str(droid)] if droid else [])]
+    sizes = ["25x120", "25x200", "100x1000", "250x3000", "500x6000"]
+    return [
+        [Section("compile", [*this, "compile"], 80)],
+        beside,
+        [Section("one wait", [*this, "one-wait"], 40)],
+        [Section("ba", [sys.executable, "-u", "-m", "benchmarks.ba", *peers, "--sizes", *sizes], 220, 5000)],
+        [Section("pipeline", [sys.executable, "-u", "-m", "benchmarks.gpu_pipeline", "--frames", "90"], 110, 3000)],
+    ]
+
+
+def _run(section: Section, end: float, output: Path | None) -> Outcome:
+    """Run a section, before the monotonic clock says `end`."""
+    start = time.monotonic()
+    limit = min(section.limit_s, end - start)
+    if limit <= 0:
+        return Outcome(section.name, "no time left", 0.0, "", section.shown)
+    # A caching allocator would hide what is read beyond the end of a tensor.
+    watched = {"PYTORCH_NO_CUDA_MEMORY_CACHING": "1"} if "--tool" in section.command else {}
+    # Processes side by side must not spin for each other's cores.
+    environment = os.environ | {"OMP_NUM_THREADS": "2", "OMP_WAIT_POLICY": "passive"} | watched
+    process = subprocess.Popen(
+        section.command,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        errors="replace",
+        env=environment,
+        start_new_session=True,
+    )
+    try:
+        said, _ = process.communicate(timeout=limit)
+        outcome = "passed" if process.returncode == 0 else f"failed ({process.returncode})"
+    except subprocess.TimeoutExpired:
+        # With its children, which hold its output open.
+        os.killpg(process.pid, signal.SIGKILL)
+        said, _ = process.communicate()
+        outcome = "out of time"
+    if output is not None:
+        (output / f"{section.name.replace(' ', '-')}.log").write_text(said)
+    found = Outcome(section.name, outcome, time.monotonic() - start, said.strip(), section.shown)
+    print(f"{found.name}: {found.outcome} after {found.seconds:.0f} s", flush=True)
+    return found
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     parser.add_argument("--vipe", type=Path, metavar="FOLDER")
+    parser.add_argument("--droid", type=Path, metavar="FOLDER")
+    parser.add_argument("--output", type=Path, metavar="FOLDER", help="where everything that is said is kept")
+    parser.add_argument("--seconds", type=float, default=560.0, help="in all")
     parser.add_argument("--check", choices=CHECKS, help="this check only, in this process")
     arguments = parser.parse_args(argv)
     if not torch.cuda.is_available():
@@ -251,27 +403,28 @@ def main(argv: Sequence[str] | None = None) -> int:
     if arguments.check:
         print(CHECKS[arguments.check]())
         return 0
-    console, failed = Console(width=140), 0
-    table = Table(title=torch.cuda.get_device_name(), show_lines=True)
-    for heading in ("section", "outcome", "seconds", "says"):
-        table.add_column(heading, justify="right" if heading == "seconds" else "left")
-    for name, command, limit in _sections(arguments.vipe):
-        start = time.perf_counter()
-        try:
-            # A caching allocator would hide what is read beyond the end of a tensor.
-            environment = os.environ | ({"PYTORCH_NO_CUDA_MEMORY_CACHING": "1"} if "--tool" in command else {})
-            done = subprocess.run(command, capture_output=True, text=True, timeout=limit, env=environment)
-            outcome = "passed" if done.returncode == 0 else f"failed ({done.returncode})"
-            said = done.stdout if done.returncode == 0 else done.stdout + done.stderr
-        except subprocess.TimeoutExpired:
-            outcome, said = "out of time", ""
-        failed += outcome != "passed"
-        spent = time.perf_counter() - start
-        long = name in ("ba", "pipeline") and outcome == "passed"
-        console.print(f"{name}: {outcome} after {spent:.0f} s" + (f"\n{said}" if long else ""), highlight=False)
-        table.add_row(name, outcome, f"{spent:.0f}", "above" if long else said.strip()[-1500:])
-    console.print(table)
-    return int(failed > 0)
+    end = time.monotonic() + arguments.seconds
+    if arguments.output is not None:
+        arguments.output.mkdir(parents=True, exist_ok=True)
+    outcomes: list[Outcome] = []
+    for group in _sections(arguments.vipe, arguments.droid):
+        with ThreadPoolExecutor(len(group)) as pool:
+            outcomes += pool.map(lambda section: _run(section, end, arguments.output), group)
+    print(summary(torch.cuda.get_device_name(), outcomes))
+    return int(not all(outcome.passed for outcome in outcomes))
+
+
+def summary(device: str, outcomes: Sequence[Outcome]) -> str:
+    """What every section said at its end, and then one line for each; less than 12,000 characters."""
+    parts = []
+    for found in outcomes:
+        # Of what failed, the end says why; measurements of a section that ran out of time are worth as much.
+        shown = found.shown if found.passed else max(found.shown, 500)
+        if found.said:
+            parts.append(f"--- {found.name}\n{found.said[-shown:]}")
+    lines = [f"{found.name:<12}{found.outcome:<14}{found.seconds:>5.0f} s" for found in outcomes]
+    said = "\n".join(parts)[-10000:]
+    return "\n".join([said, f"=== {device}", *lines])
 
 
 if __name__ == "__main__":

@@ -1,8 +1,8 @@
 """nvidia-vipe's own bundle adjustment on one of our problems, from an unpacked source distribution of it.
 
 Its default solver (`ba.fused: false`) is Python over torch and SciPy; only its SE(3) type and scatter come from a
-compiled extension. Where that is not built, they are replaced by the few lines of torch below, and nothing else is: the
-terms, the block matrices, the elimination and the sparse solve are its own. Needs `einops`.
+compiled extension. Where that is not built, they are replaced by `transforms.py`, and nothing else is: the terms, the
+block matrices, the elimination and the sparse solve are its own. Needs `einops`.
 """
 
 from __future__ import annotations
@@ -17,56 +17,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from benchmarks.peers.transforms import Transforms, scatter_sum
 from vipe_core.ba import Problem, State
-from vipe_core.geometry import se3
-
-
-class _Transform:
-    """What the solver uses of lietorch's SE3, as matrices (..., 4, 4)."""
-
-    def __init__(self, data: Tensor) -> None:
-        self.data = data
-
-    @property
-    def shape(self) -> torch.Size:
-        return self.data.shape[:-2]
-
-    @property
-    def device(self) -> torch.device:
-        return self.data.device
-
-    def inv(self) -> _Transform:
-        return _Transform(se3.inverse(self.data))
-
-    def view(self, shape: tuple[int, ...]) -> _Transform:
-        return _Transform(self.data.reshape(*shape, 4, 4))
-
-    def retr(self, twist: Tensor) -> _Transform:
-        return _Transform(se3.exp(twist) @ self.data)
-
-    def adjT(self, rows: Tensor) -> Tensor:  # noqa: N802 - its name
-        return _rows_times(rows, se3.adjoint(self.data))
-
-    def __getitem__(self, index: Any) -> _Transform:
-        return _Transform(self.data[index])
-
-    def __mul__(self, other: Any) -> Any:
-        if isinstance(other, _Transform):
-            return _Transform(self.data @ other.data)
-        return _rows_times(other, self.data.mT)
-
-
-def _rows_times(rows: Tensor, matrices: Tensor) -> Tensor:
-    """(M, ..., k) rows times one (k, k) matrix per leading index."""
-    size = rows.shape[-1]
-    return (rows.flatten(1, -2) @ matrices.reshape(-1, size, size)).view(rows.shape)
-
-
-def _scatter_add(src: Tensor, index: Tensor, dim: int = -1, dim_size: int | None = None) -> Tensor:
-    size = int(index.max()) + 1 if dim_size is None else dim_size
-    shape = list(src.shape)
-    shape[dim] = size
-    return torch.zeros(shape, dtype=src.dtype, device=src.device).index_add_(dim, index, src)
 
 
 def load(folder: Path) -> dict[str, Any]:
@@ -84,8 +36,8 @@ def load(folder: Path) -> dict[str, Any]:
             package.__path__ = [str(folder / name.replace(".", "/"))]
             sys.modules[name] = package
         stand_ins: dict[str, dict[str, Any]] = {
-            "lietorch": {"SE3": _Transform, "Sim3": type("Sim3", (), {})},
-            "scatter": {"scatter_add": _scatter_add},
+            "lietorch": {"SE3": Transforms, "Sim3": type("Sim3", (), {})},
+            "scatter": {"scatter_add": scatter_sum},
             "slam_ext": {},
         }
         for name, members in stand_ins.items():
@@ -149,7 +101,7 @@ def iteration(vipe: dict[str, Any], problem: Problem, state: State, damping: flo
 
 
 def _pose_data(transform: Any, matrices: Tensor) -> Any:
-    if transform is _Transform:
+    if transform is Transforms:
         return transform(matrices)
     from vipe_core.geometry.quaternion import quaternion_from_matrix
 
@@ -157,5 +109,5 @@ def _pose_data(transform: Any, matrices: Tensor) -> Any:
 
 
 def _matrices(poses: Any) -> Tensor:
-    matrices: Tensor = poses.data if isinstance(poses, _Transform) else poses.matrix()
+    matrices: Tensor = poses.data if isinstance(poses, Transforms) else poses.matrix()
     return matrices

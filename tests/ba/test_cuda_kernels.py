@@ -14,12 +14,16 @@ import torch
 from ba_scenes import disturbed, float32, scene, with_depth_prior, with_noise
 from cuda_emulator import COMPILER, ORDERS, EmulatedLauncher
 from hypothesis import given, settings
+from rig_scenes import disturbed_rig, rig_scene
 
-from vipe_core.ba import Edges, Free, Options, Problem, Result, State, Status, oracle, solve
+from benchmarks import gpu_checks
+from vipe_core.ba import Edges, Free, Options, Priors, Problem, Result, State, Status, cuda, oracle, solve
+from vipe_core.ba.answer import result_of
 from vipe_core.ba.cuda import layout
 from vipe_core.ba.cuda import solver as cuda_solver
 from vipe_core.ba.cuda.compiler import Specialisation
 from vipe_core.ba.cuda.context import Context
+from vipe_core.cameras import CameraModel
 from vipe_core.geometry import se3
 
 # Every kernel of residuals, every set of free intrinsics, both cameras.
@@ -52,7 +56,7 @@ def emulated(problem: Problem, state: State, options: Options, order: int = 0) -
     kind = cuda_solver.specialisation(problem, options)
     adjustment = cuda_solver.Adjustment(problem, state, options, EmulatedLauncher(kind, KINDS, order))
     adjustment.run()
-    return adjustment.result()
+    return result_of(adjustment.answer(), state)
 
 
 def problem_of(kind: Specialisation, **shape: int) -> tuple[Problem, State]:
@@ -77,6 +81,9 @@ def assert_close(found: Result, expected: Result, rtol: float = 1e-4) -> None:
     assert found.cost == pytest.approx(expected.cost, rel=rtol, abs=1e-6 * expected.initial_cost)
     torch.testing.assert_close(found.state.cam_from_world, expected.state.cam_from_world, rtol=0, atol=10 * rtol)
     torch.testing.assert_close(found.state.intrinsics, expected.state.intrinsics, rtol=rtol, atol=1e-5)
+    if expected.state.cam_from_rig is not None:
+        assert found.state.cam_from_rig is not None
+        torch.testing.assert_close(found.state.cam_from_rig, expected.state.cam_from_rig, rtol=0, atol=10 * rtol)
     depth = expected.state.inverse_depth
     assert ((found.state.inverse_depth - depth).norm() / depth.norm()) < 10 * rtol
 
@@ -116,6 +123,51 @@ def test_a_descent_is_the_hosts(kind: Specialisation) -> None:
     assert_close(found, expected, rtol=1e-3)
     for row, other in zip(found.intrinsics_covariances[0], expected.intrinsics_covariances[0], strict=True):
         assert row == pytest.approx(other, rel=1e-2)
+
+
+@pytest.mark.parametrize(
+    ("kind", "own_intrinsics", "extrinsics", "prior"),
+    [
+        (PLAIN, True, True, True),
+        (FOCAL, False, False, False),
+        (FOCAL, False, True, True),
+        (KINDS[2], True, True, False),
+    ],
+)
+def test_a_rig_is_the_hosts(kind: Specialisation, own_intrinsics: bool, extrinsics: bool, prior: bool) -> None:
+    """Poses behind several frames, extrinsics that are held or free, a camera for each view."""
+    model: CameraModel = "mei" if kind.unified else "pinhole"
+    problem, truth = rig_scene(model, num_views=3, own_intrinsics=own_intrinsics)
+    free = replace(problem.free, focal=kind.focal, extrinsics=extrinsics)
+    free.inverse_depth[[1, 5]] = False
+    assert truth.cam_from_rig is not None
+    away = se3.exp(torch.full((1, 6), 0.01, dtype=torch.float64)) @ truth.cam_from_rig
+    priors = Priors(cam_from_rig=away if prior else None, extrinsic_sigma=(0.1, 0.05))
+    problem = replace(with_noise(problem, 0.05), free=free, priors=priors)
+    problem, start = float32(problem, disturbed_rig(problem, truth, twist=0.01, turn=0.01 * extrinsics))
+    options = Options(max_iterations=4, robust=kind.robust, robust_scale_px=8.0)
+    found, expected = emulated(problem, start, options), solve(problem, start, options)
+    assert_close(found, expected, rtol=1e-3)
+    assert len(found.intrinsics_covariances) == len(expected.intrinsics_covariances)
+    assert problem.rig is not None
+    assert found.state.cam_from_rig is not None
+    rig_from_world = se3.inverse(found.state.cam_from_rig[problem.rig.view_of_frame]) @ found.state.cam_from_world
+    one_each = rig_from_world.reshape(-1, 3, 4, 4)
+    torch.testing.assert_close(one_each, one_each[:, :1].expand_as(one_each), rtol=0, atol=1e-12)
+
+
+def test_what_the_kernels_are_not_for() -> None:
+    problem, state = float32(*rig_scene(own_intrinsics=True))
+    assert cuda.takes(problem, state)
+    assert cuda.takes(replace(problem, free=replace(problem.free, extrinsics=True)), state)
+    assert not cuda.takes(replace(problem, free=replace(problem.free, focal=True)), state)
+    assert cuda.takes(
+        replace(problem, free=replace(problem.free, focal=True)), replace(state, intrinsics=torch.ones(4))
+    )
+    assert not cuda.takes(problem, replace(state, inverse_depth=state.inverse_depth.double()))
+    edges = problem.edges
+    nothing = Edges(edges.source[:0], edges.target[:0], edges.target_px[:0], edges.weight[:0])
+    assert not cuda.takes(replace(problem, edges=nothing), state)
 
 
 @st.composite
@@ -276,6 +328,21 @@ def test_nothing_to_do() -> None:
     assert emulated(held, start, Options(robust="none")).status is Status.EMPTY
 
 
+def test_what_a_gpu_is_checked_with_holds_here(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The comparison of `benchmarks.gpu_checks`, on those of its shapes that the kernels here are compiled for."""
+    shapes = [
+        (problem, start, robust)
+        for problem, start, robust in gpu_checks._shapes()
+        if cuda_solver.specialisation(problem, Options(robust=robust)) in KINDS
+    ]
+    assert any(problem.rig is not None for problem, _, _ in shapes)
+    small = sorted(shapes, key=lambda case: case[1].inverse_depth.numel())[:2] + shapes[-1:]
+    monkeypatch.setattr(gpu_checks, "_shapes", lambda: small)
+    monkeypatch.setattr(gpu_checks, "_device", lambda: torch.device("cpu"))
+    monkeypatch.setattr(gpu_checks, "_kernels", emulated)
+    assert gpu_checks.check_correct().startswith("pose")
+
+
 def test_a_run_can_be_repeated_on_new_values() -> None:
     """What a replayed CUDA graph does: the same launches after the tensors were overwritten in place."""
     problem, truth = problem_of(FOCAL, num_frames=4, height=6, width=9)
@@ -284,15 +351,15 @@ def test_a_run_can_be_repeated_on_new_values() -> None:
     launcher = EmulatedLauncher(cuda_solver.specialisation(problem, options), KINDS)
     adjustment = cuda_solver.Adjustment(problem, start, options, launcher)
     adjustment.run()
-    expected, launched = adjustment.result(), list(launcher.launched)
+    expected, launched = result_of(adjustment.answer(), start), list(launcher.launched)
     problem.edges.weight.mul_(0.0)
     adjustment.run()
-    assert adjustment.result().status is Status.EMPTY
+    assert result_of(adjustment.answer(), start).status is Status.EMPTY
     assert launcher.launched == launched
     problem, _ = float32(with_noise(problem_of(FOCAL, num_frames=4, height=6, width=9)[0], 0.2), disturbed(truth))
     adjustment._problem.edges.weight.copy_(problem.edges.weight)
     adjustment.run()
-    assert same(adjustment.result(), expected)
+    assert same(result_of(adjustment.answer(), start), expected)
 
 
 def test_the_context_is_mirrored_in_order() -> None:

@@ -1,6 +1,7 @@
 """Dense bundle adjustment: the problem, its plan, and its solvers."""
 
-from vipe_core.ba.levenberg import newton_step, pose_covariance, solve
+from vipe_core.ba.levenberg import newton_step, pose_covariance
+from vipe_core.ba.operator import solve
 from vipe_core.ba.problem import (
     Edges,
     Free,

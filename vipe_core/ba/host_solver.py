@@ -143,8 +143,8 @@ class HostSolver:
             begin, end = first[frame], first[frame + 1]
             if free:
                 cliques.append([node for k in (frame, *target[begin:end]) for node in behind[k]])
-            elif behind[frame]:
-                cliques += [[*behind[frame], *behind[j]] for j in target[begin:end] if behind[j]]
+            else:
+                cliques += [[*behind[frame], *behind[j]] for j in target[begin:end]]
         return cliques
 
     def _analyse(self) -> block_cholesky.Structure:

@@ -1,9 +1,8 @@
-"""Levenberg-Marquardt over the normal equations: the entry points of bundle adjustment.
+"""Levenberg-Marquardt over the normal equations, with the loop on the host.
 
-Single precision on a GPU is solved by `cuda/`, which follows the rules of this file on the device. Here is the loop for
-everything else. Convergence is a predicate of the expected and the actual gain, computed where the numbers are. On a
-GPU the host reads it once per step, with everything else that it decides on; on a CPU, where reading is free, a state
-that is at its minimum already costs one linearisation.
+`cuda/` follows the rules of this file on the GPU. Convergence is a predicate of the expected and the actual gain,
+computed where the numbers are. On a GPU the host reads it once per step, with everything else that it decides on; on a
+CPU, where reading is free, a state that is at its minimum already costs one linearisation.
 """
 
 from __future__ import annotations
@@ -17,7 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from vipe_core.ba import cuda, robust
+from vipe_core.ba import robust
 from vipe_core.ba.host_solver import HostSolver
 from vipe_core.ba.problem import NO_COVARIANCE, Covariance, Edges, Options, Problem, Result, Rig, State, Status
 from vipe_core.ba.reprojection import require_supported
@@ -40,30 +39,17 @@ _TRUSTED_DAMPING = 1e-2
 _NARROWING = 1.4
 
 
-def solve(problem: Problem, state: State, options: Options | None = None) -> Result:
-    """Minimise the robust cost from a state, accepting only steps that lower it.
-
-    Measurements and state may be on different devices; the work is done where `state.inverse_depth` is, in its dtype
-    (float32, or float64 throughout), with everything from 6x6 blocks on in float64.
-
-    Args:
-        problem: Graph, measurements, priors and what is free.
-        state: Where to start. It is not changed.
-        options: How to solve.
-
-    Returns:
-        The new state, on the same device, and why the solve ended. `cost` and `initial_cost` are of the measurements
-        alone; priors, and a charge for points that fall behind their target camera, take part in accepting a step.
-
-    Raises:
-        ConfigError: A camera model without derivatives here.
-        ValueError: Inverse depths that are neither float32 nor float64; a rig without its extrinsics, or with a pose
-            that is free in some frames only.
-    """
-    options = options or Options()
+def require_solvable(problem: Problem, state: State) -> None:
+    """Raises what `solve` says of a problem that it does not take."""
     require_supported(problem.camera_model)
-    if cuda.takes(problem, state) and (result := cuda.solve(problem, state, options)) is not None:
-        return result
+    if state.inverse_depth.dtype not in (torch.float32, torch.float64):
+        raise ValueError(f"inverse depths must be float32 or float64, got {state.inverse_depth.dtype}")
+    if problem.rig is not None and state.cam_from_rig is None:
+        raise ValueError("the state of a rig needs cam_from_rig")
+
+
+def descend(problem: Problem, state: State, options: Options) -> Result:
+    """`vipe_core.ba.solve`, with the loop on the host; of what `require_solvable` lets pass."""
     problem, state = _on_device(problem, state)
     if not _finite(problem, state):
         return Result(state, Status.NON_FINITE, 0, math.nan, math.nan, 0.0)
@@ -217,6 +203,7 @@ def newton_step(problem: Problem, state: State, options: Options | None = None, 
         ConfigError: A camera model without derivatives here.
     """
     options = options or Options()
+    require_solvable(problem, state)
     problem, state = _on_device(problem, state)
     solver = _solver(problem, options, state)
     return solver.step(solver.linearise(state, options.robust_scale_px), damping)
@@ -250,16 +237,11 @@ def _solver(problem: Problem, options: Options, state: State) -> Solver[Any]:
 
 def _on_device(problem: Problem, state: State) -> tuple[Problem, State]:
     """All tensors where the inverse depths are."""
-    require_supported(problem.camera_model)
-    if state.inverse_depth.dtype not in (torch.float32, torch.float64):
-        raise ValueError(f"inverse depths must be float32 or float64, got {state.inverse_depth.dtype}")
     device = state.inverse_depth.device
     if state.cam_from_world.device != device or state.intrinsics.device != device:
         state = replace(state, cam_from_world=state.cam_from_world.to(device), intrinsics=state.intrinsics.to(device))
     rig = problem.rig
-    if rig is not None:
-        if state.cam_from_rig is None:
-            raise ValueError("the state of a rig needs cam_from_rig")
+    if rig is not None and state.cam_from_rig is not None:
         state = replace(state, cam_from_rig=state.cam_from_rig.to(device))
         rig = Rig(rig.pose_of_frame.to(device), rig.view_of_frame.to(device))
     edges, priors = problem.edges, problem.priors
@@ -276,7 +258,10 @@ def _on_device(problem: Problem, state: State) -> tuple[Problem, State]:
 def _finite(problem: Problem, state: State) -> bool:
     """Whether state and priors are finite. Measurements with a weight that are not make the cost so."""
     priors = problem.priors
-    checks = [tensor.isfinite().all() for tensor in (state.cam_from_world, state.inverse_depth, state.intrinsics)]
+    tensors = [state.cam_from_world, state.inverse_depth, state.intrinsics]
+    if problem.rig is not None and state.cam_from_rig is not None:
+        tensors.append(state.cam_from_rig)
+    checks = [tensor.isfinite().all() for tensor in tensors]
     if priors.inverse_depth is not None and priors.inverse_depth_weight is not None:
         checks.append(priors.inverse_depth_weight.isfinite().all())
         checks.append((priors.inverse_depth.isfinite() | (priors.inverse_depth_weight <= 0)).all())

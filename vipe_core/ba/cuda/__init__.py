@@ -4,7 +4,8 @@ The algebra is that of `torch_solver.py`, the descent that of `levenberg.py`. Pe
 
     transform     edges of the proposed state, twists of the proposed step          (per edge)
     tile          finish the step of the depths, then cost and normal equations     (per slice of a unit)
-    fold          slices -> 6x6 blocks of poses, tail and right-hand side           (per unit)
+    fold          slices -> 6x6 blocks of frames, tail and right-hand side          (per unit)
+    turn          of a rig, -> blocks of its poses and views                        (per 7 blocks)
     assemble      -> blocks of the reduced system                                   (per 7 blocks)
     judge         accept or reject, damping, convergence                            (one)
     damp, gather, factorise, substitute                                             (per tile of the factor, by level)
@@ -18,16 +19,21 @@ from __future__ import annotations
 
 import torch
 
+from vipe_core.ba.answer import Answer
 from vipe_core.ba.cuda.launcher import device_launcher
 from vipe_core.ba.cuda.solver import Adjustment, specialisation
-from vipe_core.ba.problem import Options, Problem, Result, State
+from vipe_core.ba.problem import Options, Problem, State
 
 
 def takes(problem: Problem, state: State) -> bool:
-    """Whether the kernels are for this problem: single precision on a GPU, one camera, and something measured."""
-    depth = state.inverse_depth
-    one_camera = problem.rig is None and state.intrinsics.ndim == 1
-    return depth.device.type == "cuda" and depth.dtype == torch.float32 and one_camera and len(problem.edges.source) > 0
+    """Whether the kernels are for a problem: single precision, something measured, and no intrinsics of several views
+    that are free at once. An edge between two such cameras has more unknowns of its own than the registers hold."""
+    intrinsics_free = problem.free.focal or problem.free.distortion
+    return (
+        state.inverse_depth.dtype == torch.float32
+        and len(problem.edges.source) > 0
+        and not (state.intrinsics.ndim > 1 and intrinsics_free)
+    )
 
 
 def prepare(problem: Problem, state: State, options: Options) -> Adjustment | None:
@@ -40,11 +46,11 @@ def prepare(problem: Problem, state: State, options: Options) -> Adjustment | No
     return Adjustment(problem, state, options, launcher)
 
 
-def solve(problem: Problem, state: State, options: Options) -> Result | None:
-    """See `vipe_core.ba.solve`. One wait for the GPU, at the end; None as `prepare`."""
+def solve(problem: Problem, state: State, options: Options) -> Answer | None:
+    """See `vipe_core.ba.solve`. Nothing waits for the GPU where graph and flags are on the host; None as `prepare`."""
     with torch.cuda.device(state.inverse_depth.device):
         adjustment = prepare(problem, state, options)
         if adjustment is None:
             return None
         adjustment.run()
-        return adjustment.result()
+        return adjustment.answer()

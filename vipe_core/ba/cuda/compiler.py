@@ -24,7 +24,7 @@ _TILE = ("tile.cu",)
 # As `Robust` in `kernels/context.cu`.
 ROBUST_CODE: dict[RobustKernel, int] = {"none": 0, "huber": 1, "cauchy": 2, "geman_mcclure": 3, "tukey": 4}
 SYSTEM_KERNELS = (
-    *("begin", "widen", "transform", "largest", "fold", "assemble", "judge"),
+    *("begin", "widen", "transform", "largest", "fold", "turn", "assemble", "judge"),
     *("damp", "gather", "factorise", "substitute", "propose", "covariance", "finish"),
 )
 TILE_KERNELS = ("tile", "tile_large")

@@ -6,18 +6,20 @@ import ctypes
 
 _SIZES = (
     "num_frames num_edges num_cells width num_units num_slices num_nodes num_blocks num_sides "
-    "unified focal_free alpha_free robust anything_free max_iterations has_prior scratch_stride"
+    "unified focal_free alpha_free robust anything_free max_iterations has_prior scratch_stride "
+    "num_cameras num_views views_free has_view_prior num_pool"
 )
 _SETTINGS = (
     "stride offset robust_scale first_scale tolerance initial_damping min_damping min_depth_ratio "
-    "min_depth max_depth log_focal log_focal_information"
+    "min_depth max_depth log_focal log_focal_information place_sigma rotation_sigma"
 )
 _ADDRESSES = (
-    "target_px weight prior_value prior_weight finite median largest "
-    "pose depth intrinsics "
-    "frame_node edge_id edge_source edge_target edge_transform edge_adjoint edge_twist pose_step "
+    "target_px weight prior_value prior_weight finite median largest prior_view "
+    "pose depth intrinsics view "
+    "frame_node frame_view view_node node_view "
+    "edge_id edge_source edge_target edge_transform edge_adjoint edge_twist pose_step "
     "unit_frame unit_first unit_count unit_free unit_partial unit_direct unit_eliminated "
-    "partial scratch pool unit_sums "
+    "partial scratch pool pool_row pool_column unit_sums "
     "block_row block_column direct_first direct_entry eliminated_first eliminated_entry diagonal_block blocks "
     "tile_row tile_column tile_first product_left product_right tile_block_first tile_block "
     "column_diagonal column_first column_tile level_column factor diagonal_factor scale solution "
@@ -36,7 +38,5 @@ class Context(ctypes.Structure):
 
 
 CONTROL_BYTES = 256
-REPORT_NUMBERS = 10
-"""Status, steps tried, cost before, cost, weight, covariance missing, covariance (4)."""
 
 CONTEXT_BYTES = ctypes.sizeof(Context)

@@ -1,9 +1,10 @@
 """The shape of a bundle adjustment for the CUDA kernels, worked out on the host once per graph.
 
 Edges are ordered by (source, target). Those of a frame whose depths are eliminated make one unit, those of a frame
-whose depths are held are split. Free poses are numbered in an order of elimination with little fill; the tail (free
-intrinsics and the right-hand side) comes last. Every 6x6 block of the reduced system knows which blocks of the units it
-sums, and every 48x48 tile of its factor which products it subtracts, so the kernels need no atomics and no search.
+whose depths are held are split. Free poses, and free views of a rig, are numbered in an order of elimination with
+little fill; the tail (free intrinsics and the right-hand side) comes last. Every 6x6 block of the reduced system knows
+which blocks of the units it sums, and every 48x48 tile of its factor which products it subtracts, so the kernels need
+no atomics and no search.
 """
 
 from __future__ import annotations
@@ -44,8 +45,9 @@ class Layout:
         num_large: Units too large for shared memory; they come first.
         shared_bytes: Dynamic shared memory of the pass over the others.
         scratch_stride: Numbers that a block of threads of the large ones needs instead.
-        partial_size, pool_size: Numbers in `partial` and blocks in `pool`.
-        num_nodes: Free poses that an edge touches.
+        partial_size: Numbers in `partial`.
+        pool_size, pool_parts: Blocks in each part of `pool`, and its parts (`_PARTS`).
+        num_nodes: Unknown poses and views.
         level_tiles: (levels + 1) where the tiles of each level begin.
         level_columns: (levels + 1) where its columns begin.
     """
@@ -56,6 +58,7 @@ class Layout:
     scratch_stride: int
     partial_size: int
     pool_size: int
+    pool_parts: int
     num_nodes: int
     level_tiles: tuple[int, ...]
     level_columns: tuple[int, ...]
@@ -91,7 +94,7 @@ def unit_floats(count: int, depth_free: bool, intrinsics: int) -> int:
 def build_layout(
     source: Ints,
     target: Ints,
-    free_poses: NDArray[np.bool_],
+    unknowns: Unknowns,
     free_depths: NDArray[np.bool_],
     cells: int,
     intrinsics: int,
@@ -100,11 +103,12 @@ def build_layout(
 
     Args:
         source, target: (E,) frames of the edges, at least one edge.
-        free_poses, free_depths: (N,).
+        unknowns: What moves.
+        free_depths: (N,).
         cells: Cells of a frame.
         intrinsics: How many of log f and alpha are free.
     """
-    num_frames, slices = len(free_poses), -(-cells // SLICE)
+    num_frames, slices = len(free_depths), -(-cells // SLICE)
     order = np.argsort(source * num_frames + target, kind="stable")
     source, target = source[order], target[order]
     first = np.zeros(num_frames + 1, np.int64)
@@ -112,19 +116,18 @@ def build_layout(
 
     units, num_large = _units(first, free_depths, intrinsics)
     frame, begin, count, free = units.T
-    touched = np.zeros(num_frames, bool)
-    touched[source] = touched[target] = True
-    frames = np.flatnonzero(free_poses & touched)
-    node = np.full(num_frames, -1, np.int64)
-    node[frames] = _order(frames, source, target, units, num_frames)
-    num_nodes = len(frames)
+    poses, views, num_nodes = _nodes(unknowns, target, units)
+    behind = _Behind(poses[unknowns.pose_of_frame], views[unknowns.view_of_frame], num_nodes, unknowns.rig)
 
     triangle = (count + 1) * (count + 2) // 2 * free
     partial = (36 * triangle + count * _PRODUCT_STRIDE[intrinsics] + 2) * slices
     direct = _starts(3 * count + 3)
     eliminated = direct[-1] + _starts((count + 2) * (count + 3) // 2 * free)
     tables = {
-        "frame_node": node,
+        "frame_node": behind.pose,
+        "frame_view": unknowns.view_of_frame,
+        "view_node": views,
+        "node_view": _inverse(views, num_nodes),
         "edge_id": order,
         "edge_source": source,
         "edge_target": target,
@@ -137,7 +140,7 @@ def build_layout(
         "unit_eliminated": eliminated[:-1],
     }
     floats = [unit_floats(int(n), bool(f), intrinsics) for n, f in zip(count, free, strict=True)]
-    tables |= _blocks(units, target, node, num_nodes, direct, eliminated)
+    tables |= _blocks(units, target, behind, direct, eliminated)
     factor, level_tiles, level_columns = _factor(tables["block_row"], tables["block_column"], num_nodes)
     tables |= factor
     wide = {"unit_partial", "unit_direct", "unit_eliminated"}
@@ -148,6 +151,7 @@ def build_layout(
         scratch_stride=-(-max(floats[:num_large], default=0) // 4) * 4,
         partial_size=int(partial.sum()),
         pool_size=int(eliminated[-1]),
+        pool_parts=behind.parts,
         num_nodes=num_nodes,
         level_tiles=level_tiles,
         level_columns=level_columns,
@@ -179,30 +183,79 @@ def _units(first: Ints, free_depths: NDArray[np.bool_], intrinsics: int) -> tupl
     return units, sum(not small for small, *_ in rows)
 
 
-def _order(frames: Ints, source: Ints, target: Ints, units: Ints, num_frames: int) -> Ints:
-    """Place of each free pose in the order of elimination. A frame with free depths couples all poses that see it."""
-    number = np.full(num_frames, -1, np.int64)
-    number[frames] = np.arange(len(frames))
+@dataclass(frozen=True, slots=True)
+class Unknowns:
+    """Which poses and views move, of `vipe_core.ba.rigs.Unknowns`, and whether there is a rig.
+
+    Attributes:
+        pose_of_frame, view_of_frame: (N,).
+        poses: (R,) bool.
+        views: (V,) bool.
+    """
+
+    pose_of_frame: Ints
+    view_of_frame: Ints
+    poses: NDArray[np.bool_]
+    views: NDArray[np.bool_]
+    rig: bool
+
+
+@dataclass(frozen=True, slots=True)
+class _Behind:
+    """(N,) nodes of the pose and of the view behind each frame, -1 where held."""
+
+    pose: Ints
+    view: Ints
+    num_nodes: int
+    rig: bool
+
+    @property
+    def parts(self) -> int:
+        return 1 if not self.rig else 4 if (self.view >= 0).any() else 2
+
+
+# Parts of `pool`: blocks of two frames, then, of a rig, what they say of two poses, of view and pose, pose and view.
+_FRAMES, _POSES, _VIEW_POSE, _POSE_VIEW = range(4)
+
+
+def _inverse(places: Ints, count: int) -> Ints:
+    inverse = np.full(count, -1)
+    inverse[places[places >= 0]] = np.flatnonzero(places >= 0)
+    return inverse
+
+
+def _nodes(unknowns: Unknowns, target: Ints, units: Ints) -> tuple[Ints, Ints, int]:
+    """Place of each pose (R,) and view (V,) in the order of elimination, -1 where held; and how many there are.
+
+    A frame with free depths couples all unknowns that see it.
+    """
+    free = np.concatenate((unknowns.poses, unknowns.views))
+    number = np.where(free, np.cumsum(free) - 1, -1)
+    pose = number[unknowns.pose_of_frame]
+    view = number[len(unknowns.poses) + unknowns.view_of_frame]
+    behind = [[node for node in both if node >= 0] for both in zip(pose.tolist(), view.tolist(), strict=True)]
     cliques: list[Sequence[int]] = []
-    for frame, begin, count, free in units.tolist():
-        own, others = int(number[frame]), number[target[begin : begin + count]]
-        seen = others[others >= 0].tolist()
-        if free:
-            cliques.append(seen + [own] * (own >= 0))
-        elif own >= 0:
-            cliques += [(own, other) for other in seen]
-    return block_cholesky.analyse(len(frames), cliques, dense_last=False).place
+    for frame, begin, count, depth_free in units.tolist():
+        others = target[begin : begin + count].tolist()
+        if depth_free:
+            cliques.append([node for k in (frame, *others) for node in behind[k]])
+        else:
+            cliques += [behind[frame] + behind[other] for other in others]
+    num_nodes = int(free.sum())
+    place = np.append(block_cholesky.analyse(num_nodes, cliques, dense_last=False).place, -1)[number]
+    return place[: len(unknowns.poses)], place[len(unknowns.poses) :], num_nodes
 
 
-def _blocks(units: Ints, target: Ints, node: Ints, num_nodes: int, direct: Ints, eliminated: Ints) -> dict[str, Array]:
+def _blocks(units: Ints, target: Ints, behind: _Behind, direct: Ints, eliminated: Ints) -> dict[str, Array]:
     """The blocks of the reduced system on and below the diagonal, and what each of them sums."""
-    tail = num_nodes
+    tail, size = behind.num_nodes, int(eliminated[-1])
     keys: list[Ints] = []
     entries: list[Ints] = []
     kinds: list[Ints] = []
+    frames = np.full((2, size if behind.rig else 0), -1)
 
     def add(rows: Ints, columns: Ints, mixed: NDArray[np.bool_], block: Ints, kind: int) -> None:
-        """Sum `block` into (row, column), or its transpose into (column, row); both where two slots are one pose."""
+        """Sum `block` into (row, column), or its transpose into (column, row); both where two slots are one node."""
         for flip, chosen in ((0, rows >= columns), (1, (rows < columns) | (rows == columns) & mixed)):
             use = chosen & (rows >= 0) & (columns >= 0)
             low, high = np.minimum(rows, columns)[use], np.maximum(rows, columns)[use]
@@ -210,25 +263,37 @@ def _blocks(units: Ints, target: Ints, node: Ints, num_nodes: int, direct: Ints,
             entries.append(2 * block[use] + flip)
             kinds.append(np.full(int(use.sum()), kind))
 
+    def add_slots(slots: Ints, rows: Ints, columns: Ints, block: Ints, kind: int) -> None:
+        """Sum the blocks of pairs of slots of units, frames or -1 for the tail, into what is behind them."""
+        above, beside = slots[:, rows], slots[:, columns]
+        mixed = np.broadcast_to(rows != columns, block.shape)
+        pose, view = np.append(behind.pose, tail), np.append(behind.view, -1)
+        if not behind.rig:
+            add(pose[above], pose[beside], mixed, block, kind)
+            return
+        frames[0, block], frames[1, block] = above, beside
+        add(pose[above], pose[beside], mixed, block + _POSES * size, kind)
+        if behind.parts > 2:
+            add(view[above], view[beside], mixed, block + _FRAMES * size, kind)
+            add(view[above], pose[beside], mixed, block + _VIEW_POSE * size, kind)
+            # Of a slot with itself, that is the transpose of the one before.
+            add(np.where(mixed, pose[above], -1), view[beside], mixed, block + _POSE_VIEW * size, kind)
+
     # Units of one shape at a time.
     for count, free in sorted({(int(c), int(f)) for c, f in units[:, 2:]}):
         chosen = np.flatnonzero((units[:, 2] == count) & (units[:, 3] == free))
-        slots = np.full((len(chosen), count + 2), tail)
-        slots[:, 0] = node[units[chosen, 0]]
-        slots[:, 1:-1] = node[target[units[chosen, 1][:, None] + np.arange(count)]]
+        slots = np.full((len(chosen), count + 2), -1)
+        slots[:, 0] = units[chosen, 0]
+        slots[:, 1:-1] = target[units[chosen, 1][:, None] + np.arange(count)]
         m = np.arange(count)
         zero, end = np.zeros(count, np.int64), np.full(count, count + 1)
         # Three blocks per edge: (target, target), (target, source), (tail, target); then (source, source) and so on.
         rows = np.concatenate((np.stack((m + 1, m + 1, end), 1).ravel(), [0, count + 1, count + 1]))
         columns = np.concatenate((np.stack((m + 1, zero, m + 1), 1).ravel(), [0, 0, count + 1]))
-        blocks = direct[chosen][:, None] + np.arange(3 * count + 3)
-        mixed = np.broadcast_to(rows != columns, blocks.shape)
-        add(slots[:, rows], slots[:, columns], mixed, blocks, 0)
+        add_slots(slots, rows, columns, direct[chosen][:, None] + np.arange(3 * count + 3), 0)
         if free:
             rows, columns = np.tril_indices(count + 2)
-            blocks = eliminated[chosen][:, None] + np.arange(len(rows))
-            mixed = np.broadcast_to(rows != columns, blocks.shape)
-            add(slots[:, rows], slots[:, columns], mixed, blocks, 1)
+            add_slots(slots, rows, columns, eliminated[chosen][:, None] + np.arange(len(rows)), 1)
 
     key, entry, kind = np.concatenate(keys), np.concatenate(entries), np.concatenate(kinds)
     unique = np.unique(key)
@@ -238,8 +303,9 @@ def _blocks(units: Ints, target: Ints, node: Ints, num_nodes: int, direct: Ints,
         sorted_by = np.argsort(at, kind="stable")
         found[f"{name}_first"] = _starts(np.bincount(at, minlength=len(unique)))
         found[f"{name}_entry"] = entry[kind == code][sorted_by]
-    nodes = np.arange(num_nodes + 1)
+    nodes = np.arange(tail + 1)
     found["diagonal_block"] = np.searchsorted(unique, nodes * (tail + 1) + nodes)
+    found["pool_row"], found["pool_column"] = frames
     return found
 
 

@@ -1,8 +1,8 @@
-"""A whole bundle adjustment on the GPU: buffers, the sequence of launches, and the one read of the result.
+"""A whole bundle adjustment on the GPU: buffers, the sequence of launches, and the answer.
 
 `Adjustment` prepares a problem once; `run` only launches work on the current stream, always the same, so it can be
-captured in a CUDA graph and replayed after the tensors of problem and state were overwritten in place; `result` waits
-and reads. What each kernel does is in `kernels/*.cu`.
+captured in a CUDA graph and replayed after the tensors of problem and state were overwritten in place. What each kernel
+does is in `kernels/*.cu`.
 """
 
 from __future__ import annotations
@@ -15,11 +15,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from vipe_core.ba.answer import Answer, report_size
 from vipe_core.ba.cuda.compiler import ROBUST_CODE, Specialisation
-from vipe_core.ba.cuda.context import CONTROL_BYTES, REPORT_NUMBERS, Context
+from vipe_core.ba.cuda.context import CONTROL_BYTES, Context
 from vipe_core.ba.cuda.launcher import Launcher
-from vipe_core.ba.cuda.layout import LARGE_SHARED_BYTES, SIDE, TILE, TILE_THREADS, Layout, build_layout
-from vipe_core.ba.problem import Covariance, Options, Problem, Result, State, Status
+from vipe_core.ba.cuda.layout import LARGE_SHARED_BYTES, SIDE, TILE, TILE_THREADS, Layout, Unknowns, build_layout
+from vipe_core.ba.problem import Options, Problem, State
+from vipe_core.ba.rigs import unknowns_of
 from vipe_core.ba.solver import MIN_DAMPING
 
 # As in `kernels/context.cu`.
@@ -27,15 +29,6 @@ _WIDE_THREADS = 256
 _FACTOR_THREADS = 256
 _ASSEMBLE_BLOCKS = 7
 _COVARIANCE_ATTEMPTS = 3
-_STATUS = (
-    Status.MAX_ITERATIONS,  # still running when the launches ended
-    Status.CONVERGED,
-    Status.MAX_ITERATIONS,
-    Status.NO_PROGRESS,
-    Status.SINGULAR,
-    Status.NON_FINITE,
-    Status.EMPTY,
-)
 
 
 def specialisation(problem: Problem, options: Options) -> Specialisation:
@@ -61,20 +54,28 @@ class Adjustment:
         edges, free, priors = problem.edges, problem.free, problem.priors
         kind = specialisation(problem, options)
         self._intrinsics_free = (kind.focal, kind.alpha)
+        unknowns = unknowns_of(problem)
+        self._num_views = 0 if state.cam_from_rig is None or problem.rig is None else len(state.cam_from_rig)
+        self._num_cameras = 1 if state.intrinsics.ndim == 1 else len(state.intrinsics)
+        views = torch.zeros(max(self._num_views, 1), dtype=torch.bool)
+        views[: len(unknowns.views)] = unknowns.views
+        self._views_free = bool(views.any())
         self._layout = layout = _layout(
             *(_bytes(frames, torch.int64) for frames in (edges.source, edges.target)),
-            *(_bytes(what, torch.bool) for what in (free.poses, free.inverse_depth)),
+            *(_bytes(frames, torch.int64) for frames in (unknowns.pose_of_frame, unknowns.view_of_frame)),
+            *(_bytes(what, torch.bool) for what in (unknowns.poses, views, free.inverse_depth)),
+            self._num_views > 0,
             problem.grid.num_cells,
             sum(self._intrinsics_free),
         )
         self._tensors: dict[str, Tensor] = {}
         self._has_prior = priors.inverse_depth is not None and priors.inverse_depth_weight is not None
+        self._has_view_prior = priors.cam_from_rig is not None and free.extrinsics and self._num_views > 0
         self._allocate(layout)
         self._upload(layout)
         self._context = self._fill_context(layout)
         self._parameters = _Parameters(self._context)
         self._levels = len(layout.level_columns) - 1
-        self._report: list[float] | None = None
 
     # -- memory ----------------------------------------------------------------------------------------------------
 
@@ -88,6 +89,8 @@ class Adjustment:
         if self._has_prior and priors.inverse_depth is not None and priors.inverse_depth_weight is not None:
             tensors["prior_value"] = self._input(priors.inverse_depth)
             tensors["prior_weight"] = self._input(priors.inverse_depth_weight)
+        if priors.cam_from_rig is not None and self._has_view_prior:
+            tensors["prior_view"] = priors.cam_from_rig.to(self._device, double).contiguous()
         sides, tiles = layout.num_sides, layout.num_tiles
         large_blocks = layout.num_large * self._slices
         shapes: dict[str, tuple[torch.dtype, tuple[int, ...]]] = {
@@ -96,14 +99,15 @@ class Adjustment:
             "largest": (single, (count,)),
             "pose": (double, (2, frames, 16)),
             "depth": (single, (2, frames, cells)),
-            "intrinsics": (double, (2, 5)),
+            "intrinsics": (double, (2, self._num_cameras, 5)),
+            "view": (double, (2, self._num_views, 16)),
             "edge_transform": (single, (2, count, 12)),
             "edge_adjoint": (double, (count, 36)),
             "edge_twist": (single, (count, 8)),
             "pose_step": (double, (6 * frames + 2,)),
             "partial": (single, (layout.partial_size,)),
             "scratch": (single, (large_blocks * layout.scratch_stride,)),
-            "pool": (double, (layout.pool_size, 36)),
+            "pool": (double, (layout.pool_parts, layout.pool_size, 36)),
             "unit_sums": (double, (layout.num_units, 5)),
             "blocks": (double, (2, layout.num_blocks, 2, 36)),
             "factor": (double, (tiles, SIDE, SIDE)),
@@ -111,7 +115,7 @@ class Adjustment:
             "scale": (double, (sides * SIDE,)),
             "solution": (double, (sides * SIDE,)),
             "control": (torch.uint8, (CONTROL_BYTES,)),
-            "report": (double, (REPORT_NUMBERS,)),
+            "report": (double, (report_size(self._state),)),
         }
         for name, (dtype, shape) in shapes.items():
             tensors[name] = torch.empty(shape, dtype=dtype, device=self._device)
@@ -133,7 +137,8 @@ class Adjustment:
         for name, table in layout.tables.items():
             packed[offsets[name] : offsets[name] + table.nbytes] = np.frombuffer(table.tobytes(), np.uint8)
         on_host = torch.from_numpy(packed)
-        self._tables = on_host.to(self._device)
+        # Does not wait for the GPU: what is not pinned is copied to where the driver sends it from.
+        self._tables = on_host.to(self._device, non_blocking=True)
         self._table_offsets = offsets
 
     def _fill_context(self, layout: Layout) -> Context:
@@ -161,6 +166,11 @@ class Adjustment:
             max_iterations=options.max_iterations,
             has_prior=self._has_prior,
             scratch_stride=layout.scratch_stride,
+            num_cameras=self._num_cameras,
+            num_views=self._num_views,
+            views_free=self._views_free,
+            has_view_prior=self._has_view_prior,
+            num_pool=layout.pool_size,
             stride=problem.grid.stride,
             offset=problem.grid.offset,
             robust_scale=options.robust_scale_px,
@@ -173,6 +183,8 @@ class Adjustment:
             max_depth=options.max_inverse_depth,
             log_focal=log_focal or 0.0,
             log_focal_information=information,
+            place_sigma=priors.extrinsic_sigma[0],
+            rotation_sigma=priors.extrinsic_sigma[1],
         )
         for name, tensor in self._tensors.items():
             setattr(context, name, tensor.data_ptr())
@@ -184,7 +196,6 @@ class Adjustment:
 
     def run(self) -> None:
         """Launch everything, without waiting for any of it. May be captured."""
-        self._report = None
         self._launcher.open()
         self._reset()
         layout, options = self._layout, self._options
@@ -208,7 +219,16 @@ class Adjustment:
             self._factorise(attempt)
             self._launch("covariance", 1, 1, attempt)
         frames, cells = self._state.inverse_depth.shape
-        self._launch("finish", -(-frames * max(cells, 16) // _WIDE_THREADS), _WIDE_THREADS)
+        copied = max(frames * cells, 16 * frames, 16 * self._num_views, 5 * self._num_cameras)
+        self._launch("finish", -(-copied // _WIDE_THREADS), _WIDE_THREADS)
+
+    def assemble(self, times: int) -> None:
+        """Launch what a linearisation of the state given takes, so many times: to measure it."""
+        self._launcher.open()
+        self._reset()
+        self._launch("begin", 1, 1)
+        for _ in range(times):
+            self._linearise()
 
     def _reset(self) -> None:
         """The state into both buffers, and what depends on the input only."""
@@ -216,9 +236,11 @@ class Adjustment:
         tensors["pose"].copy_(state.cam_from_world.flatten(1))
         tensors["depth"].copy_(state.inverse_depth)
         tensors["intrinsics"].zero_()
-        tensors["intrinsics"][:, : len(state.intrinsics)].copy_(state.intrinsics)
+        tensors["intrinsics"][..., : state.intrinsics.shape[-1]].copy_(state.intrinsics)
+        if state.cam_from_rig is not None and self._num_views:
+            tensors["view"].copy_(state.cam_from_rig.flatten(1))
         tensors["median"].copy_(state.inverse_depth.median())
-        checks = [tensor.isfinite().all() for tensor in (tensors["pose"], tensors["depth"], tensors["intrinsics"])]
+        checks = [tensors[name].isfinite().all() for name in ("pose", "depth", "intrinsics", "view")]
         if self._has_prior and priors.inverse_depth is not None and priors.inverse_depth_weight is not None:
             weight = tensors["prior_weight"]
             checks.append(weight.isfinite().all())
@@ -234,6 +256,8 @@ class Adjustment:
         if small:
             self._launch("tile", small * self._slices, TILE_THREADS, layout.num_large, layout.shared_bytes)
         self._launch("fold", layout.num_units, _WIDE_THREADS)
+        if self._num_views:
+            self._launch("turn", -(-layout.pool_size // _ASSEMBLE_BLOCKS), _WIDE_THREADS)
         self._launch("assemble", -(-layout.num_blocks // _ASSEMBLE_BLOCKS), _WIDE_THREADS)
         self._launch("judge", 1, _WIDE_THREADS)
 
@@ -258,25 +282,17 @@ class Adjustment:
 
     # -- answer ----------------------------------------------------------------------------------------------------
 
-    def result(self) -> Result:
-        """Wait for the last `run`, and read what came of it."""
-        report = self._tensors["report"].tolist()
-        status = _STATUS[int(report[0])]
-        if status is Status.NON_FINITE and not self._tensors["finite"].item():
-            return Result(self._state, status, 0, math.nan, math.nan, 0.0)
-        if status in (Status.NON_FINITE, Status.EMPTY):
-            return Result(self._state, status, 0, report[2], report[3], report[4])
+    def answer(self) -> Answer:
+        """What the last `run` leaves; copies, so another one may follow."""
         tensors, given = self._tensors, self._state
-        state = State(
+        views = tensors["view"][0].view(-1, 4, 4)
+        return Answer(
             tensors["pose"][0].view_as(given.cam_from_world).clone(),
             tensors["depth"][0].clone(),
-            tensors["intrinsics"][0, : len(given.intrinsics)].clone(),
+            tensors["intrinsics"][0, :, : given.intrinsics.shape[-1]].reshape(given.intrinsics.shape).clone(),
+            (views if self._num_views or given.cam_from_rig is None else given.cam_from_rig).clone(),
+            tensors["report"].clone(),
         )
-        a, b, c, d = report[6:10]
-        covariance: Covariance = ((a, b), (c, d))
-        if report[5]:
-            covariance = ((math.nan, math.nan), (math.nan, math.nan))
-        return Result(state, status, int(report[1]), report[2], report[3], report[4], (covariance,))
 
 
 class _Parameters:
@@ -299,13 +315,20 @@ def _bytes(tensor: Tensor, dtype: torch.dtype) -> bytes:
 
 
 @lru_cache(maxsize=32)
-def _layout(source: bytes, target: bytes, poses: bytes, depths: bytes, cells: int, intrinsics: int) -> Layout:
+def _layout(
+    source: bytes,
+    target: bytes,
+    pose_of_frame: bytes,
+    view_of_frame: bytes,
+    poses: bytes,
+    views: bytes,
+    depths: bytes,
+    rig: bool,
+    cells: int,
+    intrinsics: int,
+) -> Layout:
     """`build_layout`, kept for the graphs solved last: a schedule of kernels solves the same graph several times."""
-    return build_layout(
-        np.frombuffer(source, np.int64),
-        np.frombuffer(target, np.int64),
-        np.frombuffer(poses, np.bool_),
-        np.frombuffer(depths, np.bool_),
-        cells,
-        intrinsics,
-    )
+    ints = [np.frombuffer(frames, np.int64) for frames in (source, target, pose_of_frame, view_of_frame)]
+    flags = [np.frombuffer(free, np.bool_) for free in (poses, views, depths)]
+    unknowns = Unknowns(ints[2], ints[3], flags[0], flags[1], rig)
+    return build_layout(ints[0], ints[1], unknowns, flags[2], cells, intrinsics)

@@ -36,6 +36,7 @@ typedef long long i64;
 #define NARROWING 1.4
 #define TINY 1.2e-38f
 
+// RUNNING, then as `Status` of `vipe_core/ba/problem.py`.
 enum Status { RUNNING, CONVERGED, MAX_ITERATIONS, NO_PROGRESS, SINGULAR, NON_FINITE, EMPTY };
 enum Robust { NONE, HUBER, CAUCHY, GEMAN_MCCLURE, TUKEY };
 // What the next pass over the cells is for: nothing, the normal equations at the state, or those of a candidate.
@@ -61,14 +62,18 @@ struct Control {
 // Mirrored by `context.py`; every member has eight bytes.
 struct Context {
     i64 num_frames, num_edges, num_cells, width, num_units, num_slices;
-    i64 num_nodes;    // free poses; node `num_nodes` is the tail: free intrinsics, then the right-hand side
+    i64 num_nodes;    // free poses and views; node `num_nodes` is the tail: free intrinsics, then the right-hand side
     i64 num_blocks;   // 6x6 blocks of the reduced system
     i64 num_sides;    // tiles along a side of the factor
     i64 unified, focal_free, alpha_free, robust, anything_free, max_iterations;
     i64 has_prior;
     i64 scratch_stride;  // floats of `scratch` per block
+    i64 num_cameras;     // with intrinsics of their own: 1, or the views of a rig, then none of them free
+    i64 num_views;       // of a rig; 0 without
+    i64 views_free, has_view_prior;
+    i64 num_pool;        // blocks of `pool` in each of its parts
     double stride, offset, robust_scale, first_scale, tolerance, initial_damping, min_damping, min_depth_ratio;
-    double min_depth, max_depth, log_focal, log_focal_information;
+    double min_depth, max_depth, log_focal, log_focal_information, place_sigma, rotation_sigma;
 
     // The problem. Pixels and weights are (E, P, 2), in the order that they came in.
     const float* target_px;
@@ -79,20 +84,26 @@ struct Context {
     const float* median;          // of the inverse depths
     float* largest;               // (E) argument of the robust kernel, px^2
 
-    // The state, twice: poses (2, N, 16), inverse depths (2, N, P), intrinsics (2, 5).
+    const double* prior_view;     // (V, 16)
+
+    // The state, twice: poses (2, N, 16), inverse depths (2, N, P), intrinsics (2, C, 5), cam_from_rig (2, V, 16).
     double* pose;
     float* depth;
     double* intrinsics;
+    double* view;
 
     // Edges in order of (source, target).
     const int* frame_node;  // (N) node of a free pose, or -1
+    const int* frame_view;  // (N) view of a rig, or 0
+    const int* view_node;   // (V) node of a free view, or -1
+    const int* node_view;   // (nodes) its inverse
     const int* edge_id;
     const int* edge_source;
     const int* edge_target;
     float* edge_transform;  // (2, E, 12) rows of [R | t], as the state
     double* edge_adjoint;   // (E, 36) where it was linearised last
     float* edge_twist;      // (E, 8) of the proposed step, then those of log f and alpha
-    double* pose_step;      // (N, 6)
+    double* pose_step;      // (N, 6), then those of log f and alpha
 
     // Units: the edges of a frame whose depths are eliminated together, or some of a frame whose depths are held.
     const int* unit_frame;
@@ -104,7 +115,9 @@ struct Context {
     const i64* unit_eliminated; // likewise: the lower triangle over (source, targets, tail)
     float* partial;
     float* scratch;             // rows and products of units too large for shared memory
-    double* pool;
+    double* pool;               // of frames; of a rig, then what they say of poses, and of views (`turn`)
+    const int* pool_row;        // (pool) frames of a block's rows and columns, or -1, of a rig
+    const int* pool_column;
     double* unit_sums;          // (units, 5) cost to judge, cost at the next scale, weight, all weight, prior
 
     // The reduced system in blocks: where each is summed from, (first, entries); an entry is 2 * block + transposed.
@@ -135,7 +148,7 @@ struct Context {
     double* solution;           // (48 sides)
 
     Control* control;
-    double* report;             // (10) see `finish`
+    double* report;             // as `answer.py` says
 };
 
 #ifdef CONTEXT_BYTES

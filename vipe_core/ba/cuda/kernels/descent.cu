@@ -130,15 +130,15 @@ extern "C" __global__ void __launch_bounds__(WIDE_THREADS) transform(const Conte
         twist[7] = (float)c.pose_step[c.num_frames * 6 + 1];
     }
     float* out = c.edge_transform + (next * c.num_edges + edge) * 12;
-    double* adjoint = c.edge_adjoint + edge * 36;
+    double* twists = c.edge_adjoint + edge * 36;
     for (int i = 0; i < 3; ++i) {
         const int j = (i + 1) % 3, k = (i + 2) % 3;
         out[4 * i + 3] = (float)t[i];
         for (int q = 0; q < 3; ++q) {
             out[4 * i + q] = (float)r[3 * i + q];
-            adjoint[i * 6 + q] = adjoint[(3 + i) * 6 + 3 + q] = r[3 * i + q];
-            adjoint[i * 6 + 3 + q] = t[j] * r[3 * k + q] - t[k] * r[3 * j + q];
-            adjoint[(3 + i) * 6 + q] = 0;
+            twists[i * 6 + q] = twists[(3 + i) * 6 + 3 + q] = r[3 * i + q];
+            twists[i * 6 + 3 + q] = t[j] * r[3 * k + q] - t[k] * r[3 * j + q];
+            twists[(3 + i) * 6 + q] = 0;
         }
     }
 }
@@ -176,6 +176,11 @@ extern "C" __global__ void __launch_bounds__(WIDE_THREADS) judge(const Context c
     if (c.log_focal_information > 0) {
         const double off = log(c.intrinsics[5 * linearised_state(control)]) - c.log_focal;
         prior += c.log_focal_information * off * off;
+    }
+    for (int view = 0; view < (c.has_view_prior ? c.num_views : 0); ++view) {
+        double residual[6], jacobian[6][6];
+        view_prior(c, linearised_state(control), view, residual, jacobian);
+        for (int k = 0; k < 6; ++k) prior += residual[k] * residual[k];
     }
     if (control.mode == LINEARISE) {
         judge_at(c, control, next, weight, lost, prior);
@@ -222,8 +227,14 @@ extern "C" __global__ void __launch_bounds__(WIDE_THREADS) judge(const Context c
     end_of_try(c, control, solved ? CONVERGED : control.damping > MAX_DAMPING ? NO_PROGRESS : RUNNING, better);
 }
 
-// exp(twist) pose, both (translation, rotation) from the left; rows 0..2 of 4x4.
+// exp(twist) pose, both (translation, rotation) from the left; what does not move keeps its bits.
 __device__ inline void move_pose(const double* twist, const double* pose, double* out) {
+    bool moves = false;
+    for (int k = 0; k < 6; ++k) moves = moves || twist[k] != 0;
+    if (!moves) {
+        for (int k = 0; k < 16; ++k) out[k] = pose[k];
+        return;
+    }
     const double wx = twist[3], wy = twist[4], wz = twist[5], s = wx * wx + wy * wy + wz * wz;
     double sinc, cosc, third;
     if (s < 1e-4) {
@@ -253,6 +264,11 @@ __device__ inline void move_pose(const double* twist, const double* pose, double
     for (int j = 12; j < 16; ++j) out[j] = pose[j];
 }
 
+// The step of a pose or a view; none of what is held.
+__device__ inline void node_step(const Context& c, int node, double* twist) {
+    for (int k = 0; k < 6; ++k) twist[k] = node < 0 ? 0 : c.solution[node * 6 + k] * c.scale[node * 6 + k];
+}
+
 // propose: one block of threads. Whether the solution is worth a try, and the poses and intrinsics it leads to.
 extern "C" __global__ void __launch_bounds__(WIDE_THREADS) propose(const Context c) {
     __shared__ double shared[WIDE_THREADS], intrinsic_step[2];
@@ -261,7 +277,7 @@ extern "C" __global__ void __launch_bounds__(WIDE_THREADS) propose(const Context
     const int thread = threadIdx.x, intrinsics = num_free(c);
     if (control.done || !control.solve) return;
     const double* blocks = c.blocks + control.system * c.num_blocks * 72;
-    const double* now = c.intrinsics + 5 * control.state;
+    const double* now = c.intrinsics + 5 * c.num_cameras * control.state;
     const double shrink = 1 / (1 + control.damping);
     const i64 tail = 6 * c.num_nodes;
     const bool factorised = control.factorised != 0;
@@ -322,21 +338,41 @@ extern "C" __global__ void __launch_bounds__(WIDE_THREADS) propose(const Context
     }
     __syncthreads();
     if (!tried) return;
-    double* next = c.intrinsics + 5 * (1 - control.state);
+    // Of several cameras nothing is free, and both buffers hold them.
+    double* next = c.intrinsics + 5 * c.num_cameras * (1 - control.state);
     if (thread < 5)
         next[thread] = thread < 2 && c.focal_free ? now[thread] * exp(intrinsic_step[0])
                        : thread == 4              ? now[4] + intrinsic_step[1]
                                                   : now[thread];
     if (thread < 2) c.pose_step[c.num_frames * 6 + thread] = intrinsic_step[thread];
+    const double* views = c.view + control.state * c.num_views * 16;
+    for (i64 view = thread; view < c.num_views; view += WIDE_THREADS) {
+        double twist[6];
+        node_step(c, c.view_node[view], twist);
+        move_pose(twist, views + view * 16, c.view + ((1 - control.state) * c.num_views + view) * 16);
+    }
     for (i64 frame = thread; frame < c.num_frames; frame += WIDE_THREADS) {
-        const int node = c.frame_node[frame];
         const double* pose = c.pose + (control.state * c.num_frames + frame) * 16;
         double* moved = c.pose + ((1 - control.state) * c.num_frames + frame) * 16;
-        double* twist = c.pose_step + frame * 6;
-        for (int k = 0; k < 6; ++k) twist[k] = node < 0 ? 0 : c.solution[node * 6 + k] * c.scale[node * 6 + k];
-        if (node >= 0) move_pose(twist, pose, moved);
-        else
-            for (int k = 0; k < 16; ++k) moved[k] = pose[k];
+        double* step = c.pose_step + frame * 6;
+        double twist[6];
+        node_step(c, c.frame_node[frame], twist);
+        if (c.num_views == 0) {
+            for (int k = 0; k < 6; ++k) step[k] = twist[k];
+            move_pose(twist, pose, moved);
+            continue;
+        }
+        // That of the pose as the frame sees it, then that of its view.
+        const int view = c.frame_view[frame];
+        double turned[6], between[16];
+        for (int k = 0; k < 6; ++k) {
+            turned[k] = 0;
+            for (int q = 0; q < 6; ++q) turned[k] += adjoint(views + view * 16, k, q) * twist[q];
+        }
+        node_step(c, c.view_node[view], twist);
+        for (int k = 0; k < 6; ++k) step[k] = turned[k] + twist[k];
+        move_pose(turned, pose, between);
+        move_pose(twist, between, moved);
     }
 }
 
@@ -368,8 +404,7 @@ extern "C" __global__ void covariance(const Context c, int attempt) {
     }
 }
 
-// finish: the accepted state into the first buffer, and the report:
-// status, steps tried, cost before, cost, weight, 1 where a covariance was looked for and not found, covariance (4).
+// finish: the accepted state into the first buffer, and the report (`answer.py`).
 extern "C" __global__ void __launch_bounds__(WIDE_THREADS) finish(const Context c) {
     const Control& control = *c.control;
     const i64 thread = (i64)blockIdx.x * WIDE_THREADS + threadIdx.x;
@@ -377,14 +412,19 @@ extern "C" __global__ void __launch_bounds__(WIDE_THREADS) finish(const Context 
     if (control.state) {
         if (thread < cells) c.depth[thread] = c.depth[cells + thread];
         if (thread < numbers) c.pose[thread] = c.pose[numbers + thread];
-        if (thread < 5) c.intrinsics[thread] = c.intrinsics[5 + thread];
+        if (thread < 5 * c.num_cameras) c.intrinsics[thread] = c.intrinsics[5 * c.num_cameras + thread];
+        if (thread < 16 * c.num_views) c.view[thread] = c.view[16 * c.num_views + thread];
     }
     if (thread) return;
-    c.report[0] = (double)(control.status == RUNNING ? MAX_ITERATIONS : control.status);
+    const double nan = sqrt(-1.0);
+    const bool solved = control.status != NON_FINITE && control.status != EMPTY;
+    c.report[0] = (double)((control.status == RUNNING ? MAX_ITERATIONS : control.status) - CONVERGED);
     c.report[1] = (double)control.iterations;
-    c.report[2] = control.initial_cost;
-    c.report[3] = control.measured;
-    c.report[4] = control.weight;
-    c.report[5] = num_free(c) && !control.covariance_found ? 1 : 0;
-    for (int k = 0; k < 4; ++k) c.report[6 + k] = control.covariance[k];
+    // Of a state that is not finite there is no cost.
+    c.report[2] = *c.finite ? control.initial_cost : nan;
+    c.report[3] = *c.finite ? control.measured : nan;
+    c.report[4] = *c.finite ? control.weight : 0.0;
+    const bool unknown = solved && num_free(c) && !control.covariance_found;
+    for (int k = 0; k < 4 * c.num_cameras; ++k)
+        c.report[5 + k] = unknown ? nan : c.num_cameras == 1 ? control.covariance[k] : 0.0;
 }

@@ -7,8 +7,13 @@ struct Camera {
     float fx, fy, cx, cy, alpha;
 };
 
-__device__ inline Camera camera_of(const Context& c, i64 state) {
-    const double* k = c.intrinsics + 5 * state;
+// Intrinsics (5) of a frame.
+__device__ inline const double* intrinsics_of(const Context& c, i64 state, int frame) {
+    return c.intrinsics + 5 * (c.num_cameras > 1 ? state * c.num_cameras + c.frame_view[frame] : state);
+}
+
+__device__ inline Camera camera_of(const Context& c, i64 state, int frame) {
+    const double* k = intrinsics_of(c, state, frame);
     return Camera{(float)k[0], (float)k[1], (float)k[2], (float)k[3], (float)k[4]};
 }
 
@@ -22,11 +27,11 @@ struct Rays {
 };
 #define MAX_RAY_ROWS 10
 
-// Fill the rays of a tile; thread p < TILE does cell p.
+// Fill the rays of a tile of a frame; thread p < TILE does cell p.
 template <bool UNIFIED, bool FOCAL, bool ALPHA>
-__device__ inline void fill_rays(const Context& c, i64 state, i64 cell, int p, float* rays) {
+__device__ inline void fill_rays(const Context& c, i64 state, int frame, i64 cell, int p, float* rays) {
     using R = Rays<UNIFIED, FOCAL, ALPHA>;
-    const double* k = c.intrinsics + 5 * state;
+    const double* k = intrinsics_of(c, state, frame);
     const int width = (int)c.width;
     float mx = ((float)((int)cell % width) * (float)c.stride + (float)(c.offset - k[2])) / (float)k[0];
     float my = ((float)((int)cell / width) * (float)c.stride + (float)(c.offset - k[3])) / (float)k[1];

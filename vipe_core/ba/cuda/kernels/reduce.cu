@@ -1,10 +1,18 @@
 // From the slices of the units to the blocks of the reduced system, in double precision.
 //
 // The only place that knows how the twist of an edge follows from poses: tau = delta_target - Ad delta_source. A unit
-// becomes 6x6 blocks over (source, targets, tail) in `pool`, and each block of the system then sums those that the
-// plan lists for it.
+// becomes 6x6 blocks over (source, targets, tail) in `pool`, those of a rig are taken to what is behind its frames, and
+// each block of the system then sums those that the plan lists for it.
 
 #define SIX 6
+
+// Entry of Ad = [R, [t]x R; 0, R] of a rigid transform, rows of 4x4.
+__device__ inline double adjoint(const double* pose, int row, int column) {
+    if (row >= 3) return column < 3 ? 0 : pose[4 * (row - 3) + column - 3];
+    if (column < 3) return pose[4 * row + column];
+    const int j = (row + 1) % 3, k = (row + 2) % 3, q = column - 3;
+    return pose[4 * j + 3] * pose[4 * k + q] - pose[4 * k + 3] * pose[4 * j + q];
+}
 
 // fold: one block of threads per unit.
 extern "C" __global__ void __launch_bounds__(WIDE_THREADS) fold(const Context c) {
@@ -17,7 +25,7 @@ extern "C" __global__ void __launch_bounds__(WIDE_THREADS) fold(const Context c)
     const float* partial = c.partial + c.unit_partial[unit];
     const float* edges = partial + (depth_free ? triangle(count + 1, 0) * 36 : 0);
     const float* priors = edges + (i64)count * stride;
-    const double* adjoint = c.edge_adjoint + (i64)first * 36;
+    const double* twists = c.edge_adjoint + (i64)first * 36;
     double* direct = c.pool + c.unit_direct[unit] * 36;
     double* eliminated = c.pool + c.unit_eliminated[unit] * 36;
 
@@ -70,12 +78,12 @@ extern "C" __global__ void __launch_bounds__(WIDE_THREADS) fold(const Context c)
         const int a = k / 36, row = k % 36 / 6, column = k % 6;
         double sum = 0;
         if (a < count) {
-            for (int q = 0; q < 6; ++q) sum -= direct[3 * a * 36 + row * 6 + q] * adjoint[a * 36 + q * 6 + column];
+            for (int q = 0; q < 6; ++q) sum -= direct[3 * a * 36 + row * 6 + q] * twists[a * 36 + q * 6 + column];
             direct[(3 * a + 1) * 36 + row * 6 + column] = sum;
         } else {
             for (int m = 0; m < count; ++m)
                 for (int q = 0; q < 6; ++q)
-                    sum -= direct[(3 * m + 2) * 36 + row * 6 + q] * adjoint[m * 36 + q * 6 + column];
+                    sum -= direct[(3 * m + 2) * 36 + row * 6 + q] * twists[m * 36 + q * 6 + column];
             direct[(3 * count + 1) * 36 + row * 6 + column] = sum;
         }
         if (!depth_free) continue;
@@ -83,7 +91,7 @@ extern "C" __global__ void __launch_bounds__(WIDE_THREADS) fold(const Context c)
         for (int m = 0; m < count; ++m) {
             const double* block = eliminated + (m <= a ? triangle(a + 1, m + 1) : triangle(m + 1, a + 1)) * 36;
             for (int q = 0; q < 6; ++q)
-                sum -= (m <= a ? block[row * 6 + q] : block[q * 6 + row]) * adjoint[m * 36 + q * 6 + column];
+                sum -= (m <= a ? block[row * 6 + q] : block[q * 6 + row]) * twists[m * 36 + q * 6 + column];
         }
         eliminated[triangle(a + 1, 0) * 36 + row * 6 + column] = sum;
     }
@@ -94,9 +102,74 @@ extern "C" __global__ void __launch_bounds__(WIDE_THREADS) fold(const Context c)
         double sum = 0;
         for (int m = 0; m < count; ++m) {
             const double* block = kind ? eliminated + triangle(m + 1, 0) * 36 : direct + (3 * m + 1) * 36;
-            for (int q = 0; q < 6; ++q) sum -= adjoint[m * 36 + q * 6 + row] * block[q * 6 + column];
+            for (int q = 0; q < 6; ++q) sum -= twists[m * 36 + q * 6 + row] * block[q * 6 + column];
         }
         (kind ? eliminated : direct + 3 * count * 36)[row * 6 + column] = sum;
+    }
+}
+
+// turn: of a rig, seven blocks of the pool per block of threads, 36 threads each. The twist of a frame is
+// Ad(cam_from_rig) of its pose's plus that of its view (`vipe_core/ba/rigs.py`): a block of two frames says a block of
+// their poses, and one of view and pose, of pose and view, and of their views, which is as it is.
+extern "C" __global__ void __launch_bounds__(WIDE_THREADS) turn(const Context c) {
+    __shared__ double blocks[ASSEMBLE_BLOCKS][36], rows[ASSEMBLE_BLOCKS][36], columns[ASSEMBLE_BLOCKS][36];
+    __shared__ double halves[ASSEMBLE_BLOCKS][36];
+    const Control& control = *c.control;
+    if (control.done || control.mode == IDLE) return;
+    const int group = threadIdx.x / 36, value = threadIdx.x % 36, row = value / 6, column = value % 6;
+    const i64 block = (i64)blockIdx.x * ASSEMBLE_BLOCKS + group;
+    const bool inside = group < ASSEMBLE_BLOCKS && block < c.num_pool;
+    if (inside) {
+        const double* views = c.view + linearised_state(control) * c.num_views * 16;
+        const int above = c.pool_row[block], beside = c.pool_column[block];
+        blocks[group][value] = c.pool[block * 36 + value];
+        rows[group][value] = above < 0 ? row == column : adjoint(views + c.frame_view[above] * 16, row, column);
+        columns[group][value] = beside < 0 ? row == column : adjoint(views + c.frame_view[beside] * 16, row, column);
+    }
+    __syncthreads();
+    if (inside) {
+        double right = 0, left = 0;
+        for (int k = 0; k < 6; ++k) {
+            right += blocks[group][row * 6 + k] * columns[group][k * 6 + column];
+            left += rows[group][k * 6 + row] * blocks[group][k * 6 + column];
+        }
+        halves[group][value] = right;
+        if (c.views_free) {
+            c.pool[(2 * c.num_pool + block) * 36 + value] = right;
+            c.pool[(3 * c.num_pool + block) * 36 + value] = left;
+        }
+    }
+    __syncthreads();
+    if (!inside) return;
+    double both = 0;
+    for (int k = 0; k < 6; ++k) both += rows[group][k * 6 + row] * halves[group][k * 6 + column];
+    c.pool[(c.num_pool + block) * 36 + value] = both;
+}
+
+// How far a view is from its prior, in standard deviations, and the derivatives by its left twist; see
+// `vipe_core/ba/rigs.py`.
+__device__ inline void view_prior(const Context& c, i64 state, int view, double* residual, double (*jacobian)[6]) {
+    const double* now = c.view + (state * c.num_views + view) * 16;
+    const double* prior = c.prior_view + view * 16;
+    double r[3][3], t[3], trace = 0;
+    for (int i = 0; i < 3; ++i) {
+        t[i] = now[4 * i + 3];
+        for (int j = 0; j < 3; ++j) {
+            r[i][j] = now[4 * i] * prior[4 * j] + now[4 * i + 1] * prior[4 * j + 1] + now[4 * i + 2] * prior[4 * j + 2];
+            t[i] -= r[i][j] * prior[4 * j + 3];
+        }
+        trace += r[i][i];
+    }
+    for (int i = 0; i < 3; ++i) {
+        const int j = (i + 1) % 3, k = (i + 2) % 3;
+        residual[i] = t[i] / c.place_sigma;
+        residual[3 + i] = (r[k][j] - r[j][k]) / (2 * c.rotation_sigma);
+        for (int q = 0; q < 3; ++q) {
+            jacobian[i][q] = (i == q) / c.place_sigma;
+            jacobian[i][3 + q] = (q == j ? t[k] : q == k ? -t[j] : 0) / c.place_sigma;
+            jacobian[3 + i][q] = 0;
+            jacobian[3 + i][3 + q] = ((i == q) * trace - r[i][q]) / (2 * c.rotation_sigma);
+        }
     }
 }
 
@@ -122,6 +195,15 @@ extern "C" __global__ void __launch_bounds__(WIDE_THREADS) assemble(const Contex
         const double off = c.log_focal - log(c.intrinsics[5 * linearised_state(control)]);
         if (value == 0) direct += c.log_focal_information;
         if (value == right || value == right * 6) direct += c.log_focal_information * off;
+    }
+    if (c.has_view_prior && c.block_column[block] < c.num_nodes) {
+        const int view = c.node_view[c.block_column[block]];
+        const bool diagonal = c.block_row[block] == c.block_column[block];
+        if (view >= 0 && (diagonal || (c.block_row[block] == c.num_nodes && row == num_free(c)))) {
+            double residual[6], jacobian[6][6];
+            view_prior(c, linearised_state(control), view, residual, jacobian);
+            for (int k = 0; k < 6; ++k) direct += jacobian[k][column] * (diagonal ? jacobian[k][row] : -residual[k]);
+        }
     }
     double* out = c.blocks + ((1 - control.system) * c.num_blocks + block) * 72;
     out[value] = direct;

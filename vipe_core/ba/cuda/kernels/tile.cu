@@ -105,7 +105,7 @@ __device__ inline void tile_pass(const Context& c, int first_unit, float* shared
     float* edges = products + at.products();  // (count, STRIDE)
     for (i64 k = thread; k < at.products() + (i64)count * STRIDE; k += TILE_THREADS) products[k] = 0.0f;
 
-    const Camera before = camera_of(c, now), camera = camera_of(c, next);
+    Camera before = camera_of(c, now, frame), camera = camera_of(c, next, frame);
     const float scale_now = (float)control.scale_system;
     const float scale_judge = (float)control.scale_judge, scale_next = (float)control.scale_next;
     const float c2_now = scale_now * scale_now, c2_judge = scale_judge * scale_judge;
@@ -128,7 +128,7 @@ __device__ inline void tile_pass(const Context& c, int first_unit, float* shared
                 prior_weight = c.prior_weight[(i64)frame * P + cell];
                 prior_value = prior_weight > 0.0f ? c.prior_value[(i64)frame * P + cell] : depth;
             }
-            fill_rays<UNIFIED, FOCAL, ALPHA>(c, step && depth_free ? now : next, near, thread, rays);
+            fill_rays<UNIFIED, FOCAL, ALPHA>(c, step && depth_free ? now : next, frame, near, thread, rays);
         }
         __syncthreads();
 
@@ -138,6 +138,7 @@ __device__ inline void tile_pass(const Context& c, int first_unit, float* shared
                 const i64 edge = first + m, row = (i64)c.edge_id[edge] * P;
                 const float* transform = c.edge_transform + (now * c.num_edges + edge) * 12;
                 const float* twist = c.edge_twist + edge * 8;
+                if (c.num_cameras > 1) before = camera_of(c, now, c.edge_target[edge]);
 #pragma unroll
                 for (int h = 0; h < 2; ++h) {
                     const int p = lane + 32 * h;
@@ -196,7 +197,7 @@ __device__ inline void tile_pass(const Context& c, int first_unit, float* shared
                 depth = depth < low ? low : depth > high ? high : depth;
                 depths[thread] = depth;
                 if (real) c.depth[(next * c.num_frames + frame) * P + cell] = depth;
-                fill_rays<UNIFIED, FOCAL, ALPHA>(c, next, real ? cell : P - 1, thread, rays);
+                fill_rays<UNIFIED, FOCAL, ALPHA>(c, next, frame, real ? cell : P - 1, thread, rays);
             }
             __syncthreads();
         }
@@ -209,6 +210,7 @@ __device__ inline void tile_pass(const Context& c, int first_unit, float* shared
         for (int m = warp; m < count; m += TILE_WARPS) {
             const i64 edge = first + m, row = (i64)c.edge_id[edge] * P;
             const float* transform = c.edge_transform + (next * c.num_edges + edge) * 12;
+            if (c.num_cameras > 1) camera = camera_of(c, next, c.edge_target[edge]);
             float sums[STRIDE];
 #pragma unroll
             for (int k = 0; k < STRIDE; ++k) sums[k] = 0.0f;

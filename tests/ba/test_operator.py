@@ -1,0 +1,106 @@
+"""Bundle adjustment as an operator of torch: schema, shapes, no aliases, and that `solve` is it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import fields, replace
+from typing import Any
+
+import pytest
+import torch
+from ba_scenes import disturbed, float32, scene, with_depth_prior, with_noise
+from rig_scenes import disturbed_rig, rig_scene
+from torch.utils._python_dispatch import TorchDispatchMode
+
+from vipe_core.ba import Options, Priors, Problem, State, Status, levenberg, solve
+from vipe_core.ba.answer import answer_of, result_of
+
+
+def plain() -> tuple[Problem, State]:
+    problem, truth = scene("mei", num_frames=3, height=3, width=4, distortion_free=True)
+    problem = with_depth_prior(with_noise(problem, 0.1), truth.inverse_depth, 0.5)
+    problem = replace(problem, priors=replace(problem.priors, log_focal=4.0, log_focal_sigma=0.2))
+    return float32(problem, disturbed(truth))
+
+
+def rig() -> tuple[Problem, State]:
+    problem, truth = rig_scene(num_poses=3, own_intrinsics=True, height=3, width=4)
+    prior = Priors(log_focal=(3.0, 3.1), cam_from_rig=truth.cam_from_rig, extrinsic_sigma=(0.1, 0.2))
+    free = replace(problem.free, focal=True, extrinsics=True)
+    return replace(with_noise(problem, 0.05), free=free, priors=prior), disturbed_rig(problem, truth)
+
+
+class _Seen(TorchDispatchMode):
+    """The arguments of the operator's calls."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.calls: list[tuple[Any, ...]] = []
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        if func is torch.ops.vipe_core.bundle_adjustment.default:
+            self.calls.append(args)
+        return func(*args, **(kwargs or {}))
+
+
+@contextmanager
+def seen() -> Iterator[_Seen]:
+    with _Seen() as mode:
+        yield mode
+
+
+@pytest.mark.parametrize("case", [plain, rig])
+def test_torch_accepts_the_operator(case: Any) -> None:
+    """Its schema, that it neither changes nor returns what it is given, and the shapes that its fake foretells."""
+    problem, state = case()
+    with seen() as mode:
+        result = solve(problem, state, Options(max_iterations=2))
+    assert result.status is Status.MAX_ITERATIONS
+    (arguments,) = mode.calls
+    torch.library.opcheck(torch.ops.vipe_core.bundle_adjustment.default, arguments)
+
+
+@pytest.mark.parametrize("case", [plain, rig])
+def test_what_is_asked_arrives(case: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every field of problem, state and options, none of them at its default."""
+    problem, state = case()
+    options = Options(
+        max_iterations=3,
+        relative_tolerance=1e-3,
+        robust="cauchy",
+        robust_scale_px=2.0,
+        initial_scale_px=math.inf,
+        initial_damping=1e-3,
+        min_inverse_depth=2e-3,
+        max_inverse_depth=2e3,
+        min_depth_ratio=0.2,
+    )
+    assert all(getattr(options, field.name) != field.default for field in fields(options))
+    arrived: list[tuple[Problem, State, Options]] = []
+    descend = levenberg.descend
+    monkeypatch.setattr(levenberg, "descend", lambda *given: arrived.append(given) or descend(*given))
+    solve(problem, state, options)
+    ((there, start, how),) = arrived
+    assert how == options
+    assert _equal(there, problem)
+    assert _equal(start, state)
+
+
+def _equal(one: Any, other: Any) -> bool:
+    if isinstance(one, torch.Tensor):
+        return torch.equal(one, other)
+    if hasattr(one, "__dataclass_fields__"):
+        return all(_equal(getattr(one, field.name), getattr(other, field.name)) for field in fields(one))
+    return bool(one == other)
+
+
+@pytest.mark.parametrize("case", [plain, rig])
+def test_an_answer_says_what_the_result_does(case: Any) -> None:
+    problem, state = case()
+    result = levenberg.descend(problem, state, Options(max_iterations=2))
+    again = result_of(answer_of(result), state)
+    assert _equal(again, result)
+    for status in (Status.EMPTY, Status.NON_FINITE):
+        assert result_of(answer_of(replace(result, status=status)), state).state is state

@@ -1,0 +1,181 @@
+"""Bundle adjustment as one operator of torch: `vipe_core::bundle_adjustment`, and the entry point that calls it.
+
+An operator is a whole solve and not a step of it. Steps are decided on by costs that the solver has; between two
+operators they would come back to the host, or every caller would carry the state of the descent around. So there is one
+place where a device is chosen (torch's dispatcher), nothing but the answer is read, and what a tracer or a compiler of
+torch sees is one opaque function without side effects.
+
+Where `State.inverse_depth` is on a CPU, the descent of `levenberg.py` runs over compiled loops or torch; on a GPU, the
+CUDA kernels run it, or `levenberg.py` over torch on that GPU: for what `cuda.takes` says they are not for, and where
+they cannot be had.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, cast
+
+import torch
+from torch import Tensor
+
+from vipe_core.ba import cuda, levenberg
+from vipe_core.ba.answer import Answer, answer_of, report_size, result_of
+from vipe_core.ba.problem import Edges, Free, Grid, Options, Priors, Problem, Result, Rig, RobustKernel, State
+from vipe_core.cameras import CameraModel
+
+
+def solve(problem: Problem, state: State, options: Options | None = None) -> Result:
+    """Minimise the robust cost from a state, accepting only steps that lower it.
+
+    Measurements and state may be on different devices; the work is done where `state.inverse_depth` is, in its dtype
+    (float32, or float64 throughout), with everything from 6x6 blocks on in float64. A graph, and what is free of it,
+    that are on the host save waits for the GPU.
+
+    Args:
+        problem: Graph, measurements, priors and what is free.
+        state: Where to start. It is not changed.
+        options: How to solve.
+
+    Returns:
+        The new state, on the same device, and why the solve ended. `cost` and `initial_cost` are of the measurements
+        alone; priors, and a charge for points that fall behind their target camera, take part in accepting a step.
+
+    Raises:
+        ConfigError: A camera model without derivatives here.
+        ValueError: Inverse depths that are neither float32 nor float64; a rig without its extrinsics, or with a pose
+            that is free in some frames only.
+    """
+    levenberg.require_solvable(problem, state)
+    device = state.inverse_depth.device
+    edges, free, priors, rig, options = problem.edges, problem.free, problem.priors, problem.rig, options or Options()
+    log_focal = priors.log_focal
+    answer = bundle_adjustment(
+        problem.camera_model,
+        [problem.grid.height, problem.grid.width],
+        [problem.grid.stride, problem.grid.offset],
+        edges.source.cpu(),
+        edges.target.cpu(),
+        edges.target_px.to(device),
+        edges.weight.to(device),
+        free.poses.cpu(),
+        free.inverse_depth.cpu(),
+        [free.focal, free.distortion, free.extrinsics],
+        None if priors.inverse_depth is None else priors.inverse_depth.to(device),
+        None if priors.inverse_depth_weight is None else priors.inverse_depth_weight.to(device),
+        [] if log_focal is None else list(log_focal) if isinstance(log_focal, tuple) else [log_focal],
+        priors.cam_from_rig,
+        [priors.log_focal_sigma, *priors.extrinsic_sigma],
+        None if rig is None else rig.pose_of_frame.cpu(),
+        None if rig is None else rig.view_of_frame.cpu(),
+        state.cam_from_world.to(device),
+        state.inverse_depth,
+        state.intrinsics.to(device),
+        None if state.cam_from_rig is None else state.cam_from_rig.to(device),
+        options.robust,
+        options.max_iterations,
+        options.initial_scale_px,
+        [
+            options.relative_tolerance,
+            options.robust_scale_px,
+            options.initial_damping,
+            options.min_inverse_depth,
+            options.max_inverse_depth,
+            options.min_depth_ratio,
+        ],
+    )
+    return result_of(Answer(*answer), state)
+
+
+def _problem(
+    camera_model: str,
+    grid_cells: Sequence[int],
+    grid_px: Sequence[float],
+    source: Tensor,
+    target: Tensor,
+    target_px: Tensor,
+    weight: Tensor,
+    free_poses: Tensor,
+    free_depths: Tensor,
+    free: Sequence[bool],
+    prior_depth: Tensor | None,
+    prior_depth_weight: Tensor | None,
+    prior_log_focal: Sequence[float],
+    prior_cam_from_rig: Tensor | None,
+    prior_sigmas: Sequence[float],
+    pose_of_frame: Tensor | None,
+    view_of_frame: Tensor | None,
+    cam_from_world: Tensor,
+    inverse_depth: Tensor,
+    intrinsics: Tensor,
+    cam_from_rig: Tensor | None,
+    robust: str,
+    max_iterations: int,
+    initial_scale_px: float | None,
+    settings: Sequence[float],
+) -> tuple[Problem, State, Options]:
+    """The arguments of the operator, put together again."""
+    log_focal = tuple(prior_log_focal)
+    tolerance, scale_px, damping, least_depth, most_depth, depth_ratio = settings
+    problem = Problem(
+        cast("CameraModel", camera_model),
+        Grid(*grid_cells, *grid_px),
+        Edges(source, target, target_px, weight),
+        Free(free_poses, free_depths, *free),
+        Priors(
+            prior_depth,
+            prior_depth_weight,
+            None if not log_focal else log_focal[0] if len(log_focal) == 1 else log_focal,
+            prior_sigmas[0],
+            prior_cam_from_rig,
+            (prior_sigmas[1], prior_sigmas[2]),
+        ),
+        None if pose_of_frame is None or view_of_frame is None else Rig(pose_of_frame, view_of_frame),
+    )
+    options = Options(
+        max_iterations=max_iterations,
+        relative_tolerance=tolerance,
+        robust=cast("RobustKernel", robust),
+        robust_scale_px=scale_px,
+        initial_scale_px=initial_scale_px,
+        initial_damping=damping,
+        min_inverse_depth=least_depth,
+        max_inverse_depth=most_depth,
+        min_depth_ratio=depth_ratio,
+    )
+    return problem, State(cam_from_world, inverse_depth, intrinsics, cam_from_rig), options
+
+
+# As `_problem`, and `Answer`.
+_SCHEMA = (
+    "(str camera_model, int[] grid_cells, float[] grid_px, Tensor source, Tensor target, Tensor target_px, "
+    "Tensor weight, Tensor free_poses, Tensor free_depths, bool[] free, Tensor? prior_depth, "
+    "Tensor? prior_depth_weight, float[] prior_log_focal, Tensor? prior_cam_from_rig, float[] prior_sigmas, "
+    "Tensor? pose_of_frame, Tensor? view_of_frame, Tensor cam_from_world, Tensor inverse_depth, Tensor intrinsics, "
+    "Tensor? cam_from_rig, str robust, int max_iterations, float? initial_scale_px, float[] settings) "
+    "-> (Tensor cam_from_world, Tensor inverse_depth, Tensor intrinsics, Tensor cam_from_rig, Tensor report)"
+)
+
+
+@torch.library.custom_op("vipe_core::bundle_adjustment", mutates_args=(), device_types="cpu", schema=_SCHEMA)
+def bundle_adjustment(*arguments: Any) -> Answer:
+    """Arguments as of `_problem`. The graph and what is free are on the host, all else where the inverse depths are."""
+    return answer_of(levenberg.descend(*_problem(*arguments)))
+
+
+@bundle_adjustment.register_kernel("cuda")
+def _on_gpu(*arguments: Any) -> Answer:
+    given = _problem(*arguments)
+    answer = cuda.solve(*given) if cuda.takes(*given[:2]) else None
+    return answer_of(levenberg.descend(*given)) if answer is None else answer
+
+
+@bundle_adjustment.register_fake
+def _shapes(*arguments: Any) -> Answer:
+    _, state, _ = _problem(*arguments)
+    return Answer(
+        torch.empty_like(state.cam_from_world),
+        torch.empty_like(state.inverse_depth),
+        torch.empty_like(state.intrinsics),
+        state.cam_from_world.new_empty(0, 4, 4) if state.cam_from_rig is None else torch.empty_like(state.cam_from_rig),
+        state.inverse_depth.new_empty(report_size(state), dtype=torch.float64),
+    )
