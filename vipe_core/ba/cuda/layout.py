@@ -27,7 +27,7 @@ SLICE = 256
 TILE_THREADS = 128
 SIDE_BLOCKS = 8
 SIDE = 6 * SIDE_BLOCKS
-_FIXED_FLOATS = 10 * TILE + 2 * TILE + TILE_THREADS // 32 * 4 * TILE
+_FIXED_FLOATS = 20 + 10 * TILE + 2 * TILE + TILE_THREADS // 32 * 4 * TILE
 _PRODUCT_STRIDE = (32, 40, 48)
 
 # What every GPU since compute capability 8.0 can give a block of threads: 99 KiB.
@@ -126,6 +126,7 @@ def build_layout(
     tables = {
         "frame_node": behind.pose,
         "frame_view": unknowns.view_of_frame,
+        "frame_camera": unknowns.view_of_frame * (unknowns.cameras > 1),
         "view_node": views,
         "node_view": _inverse(views, num_nodes),
         "edge_id": order,
@@ -185,12 +186,14 @@ def _units(first: Ints, free_depths: NDArray[np.bool_], intrinsics: int) -> tupl
 
 @dataclass(frozen=True, slots=True)
 class Unknowns:
-    """Which poses and views move, of `vipe_core.ba.rigs.Unknowns`, and whether there is a rig.
+    """Which poses and views move, of `vipe_core.ba.rigs.Unknowns`.
 
     Attributes:
         pose_of_frame, view_of_frame: (N,).
         poses: (R,) bool.
         views: (V,) bool.
+        rig: Whether there is one.
+        cameras: How many intrinsics there are: one, or one for each view.
     """
 
     pose_of_frame: Ints
@@ -198,6 +201,7 @@ class Unknowns:
     poses: NDArray[np.bool_]
     views: NDArray[np.bool_]
     rig: bool
+    cameras: int
 
 
 @dataclass(frozen=True, slots=True)

@@ -25,6 +25,7 @@ from vipe_core.ba.rigs import unknowns_of
 from vipe_core.ba.solver import MIN_DAMPING
 
 # As in `kernels/context.cu`.
+_EDGE_FLOATS = 20
 _WIDE_THREADS = 256
 _FACTOR_THREADS = 256
 _ASSEMBLE_BLOCKS = 7
@@ -65,6 +66,7 @@ class Adjustment:
             *(_bytes(frames, torch.int64) for frames in (unknowns.pose_of_frame, unknowns.view_of_frame)),
             *(_bytes(what, torch.bool) for what in (unknowns.poses, views, free.inverse_depth)),
             self._num_views > 0,
+            self._num_cameras,
             problem.grid.num_cells,
             sum(self._intrinsics_free),
         )
@@ -101,7 +103,7 @@ class Adjustment:
             "depth": (single, (2, frames, cells)),
             "intrinsics": (double, (2, self._num_cameras, 5)),
             "view": (double, (2, self._num_views, 16)),
-            "edge_transform": (single, (2, count, 12)),
+            "edge_transform": (single, (2, count, _EDGE_FLOATS)),
             "edge_adjoint": (double, (count, 36)),
             "edge_twist": (single, (count, 8)),
             "pose_step": (double, (6 * frames + 2,)),
@@ -324,11 +326,12 @@ def _layout(
     views: bytes,
     depths: bytes,
     rig: bool,
+    cameras: int,
     cells: int,
     intrinsics: int,
 ) -> Layout:
     """`build_layout`, kept for the graphs solved last: a schedule of kernels solves the same graph several times."""
     ints = [np.frombuffer(frames, np.int64) for frames in (source, target, pose_of_frame, view_of_frame)]
     flags = [np.frombuffer(free, np.bool_) for free in (poses, views, depths)]
-    unknowns = Unknowns(ints[2], ints[3], flags[0], flags[1], rig)
+    unknowns = Unknowns(ints[2], ints[3], flags[0], flags[1], rig, cameras)
     return build_layout(ints[0], ints[1], unknowns, flags[2], cells, intrinsics)

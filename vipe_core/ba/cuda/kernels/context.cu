@@ -17,6 +17,8 @@ typedef long long i64;
 #define SLICE 256
 #define TILE_THREADS 128
 #define TILE_WARPS (TILE_THREADS / 32)
+// Numbers of an edge's transform and camera.
+#define EDGE_FLOATS 20
 // Scalars of the reduced system per tile of its factor: eight blocks of six.
 #define SIDE 48
 #define SIDE_BLOCKS 8
@@ -93,14 +95,15 @@ struct Context {
     double* view;
 
     // Edges in order of (source, target).
-    const int* frame_node;  // (N) node of a free pose, or -1
-    const int* frame_view;  // (N) view of a rig, or 0
-    const int* view_node;   // (V) node of a free view, or -1
-    const int* node_view;   // (nodes) its inverse
+    const int* frame_node;    // (N) node of a free pose, or -1
+    const int* frame_view;    // (N) view of a rig, or 0
+    const int* frame_camera;  // (N) whose intrinsics it has
+    const int* view_node;     // (V) node of a free view, or -1
+    const int* node_view;     // (nodes) its inverse
     const int* edge_id;
     const int* edge_source;
     const int* edge_target;
-    float* edge_transform;  // (2, E, 12) rows of [R | t], as the state
+    float* edge_transform;  // (2, E, 20) rows of [R | t] and the intrinsics (5) of the target, as the state
     double* edge_adjoint;   // (E, 36) where it was linearised last
     float* edge_twist;      // (E, 8) of the proposed step, then those of log f and alpha
     double* pose_step;      // (N, 6), then those of log f and alpha
@@ -181,6 +184,11 @@ __device__ inline double robust_cost(int kernel, double scale, double squared) {
         case GEMAN_MCCLURE: return squared * (c2 / (c2 + squared));
         default: return squared;
     }
+}
+
+// Intrinsics (5) of a frame.
+__device__ inline const double* intrinsics_of(const Context& c, int state, int frame) {
+    return c.intrinsics + 5 * (state * (int)c.num_cameras + c.frame_camera[frame]);
 }
 
 // The state that the pass in hand linearises.

@@ -129,7 +129,9 @@ extern "C" __global__ void __launch_bounds__(WIDE_THREADS) transform(const Conte
         twist[6] = (float)c.pose_step[c.num_frames * 6];
         twist[7] = (float)c.pose_step[c.num_frames * 6 + 1];
     }
-    float* out = c.edge_transform + (next * c.num_edges + edge) * 12;
+    float* out = c.edge_transform + (next * c.num_edges + edge) * EDGE_FLOATS;
+    const double* camera = intrinsics_of(c, (int)next, (int)target);
+    for (int k = 0; k < 5; ++k) out[12 + k] = (float)camera[k];
     double* twists = c.edge_adjoint + edge * 36;
     for (int i = 0; i < 3; ++i) {
         const int j = (i + 1) % 3, k = (i + 2) % 3;

@@ -6,13 +6,13 @@ __device__ inline void largest_of_edge(const Context& c, float* rays, float* fou
     const int thread = threadIdx.x;
     const i64 edge = blockIdx.x, P = c.num_cells, row = (i64)c.edge_id[edge] * P;
     const int source = c.edge_source[edge];
-    const Camera camera = camera_of(c, 0, c.edge_target[edge]);
-    const float* transform = c.edge_transform + edge * 12;
+    const float* transform = c.edge_transform + edge * EDGE_FLOATS;
+    const Camera camera = camera_of(transform);
     float most = 0.0f;
     for (i64 start = 0; start < P; start += TILE) {
         const bool inside = start + thread < P;
         const i64 cell = inside ? start + thread : P - 1;
-        fill_rays<UNIFIED, false, false>(c, 0, source, cell, thread, rays);
+        fill_rays<UNIFIED, false, false>(c, intrinsics_of(c, 0, source), cell, thread, rays);
         const View view = see<UNIFIED, false, false>(camera, transform, rays, thread,
                                                      c.depth[source * P + cell],
                                                      ((const float2*)c.target_px)[row + cell],

@@ -7,14 +7,9 @@ struct Camera {
     float fx, fy, cx, cy, alpha;
 };
 
-// Intrinsics (5) of a frame.
-__device__ inline const double* intrinsics_of(const Context& c, i64 state, int frame) {
-    return c.intrinsics + 5 * (c.num_cameras > 1 ? state * c.num_cameras + c.frame_view[frame] : state);
-}
-
-__device__ inline Camera camera_of(const Context& c, i64 state, int frame) {
-    const double* k = intrinsics_of(c, state, frame);
-    return Camera{(float)k[0], (float)k[1], (float)k[2], (float)k[3], (float)k[4]};
+// The camera that an edge's points are seen with, beside its transform.
+__device__ inline Camera camera_of(const float* transform) {
+    return Camera{transform[12], transform[13], transform[14], transform[15], transform[16]};
 }
 
 // Rows of the rays in shared memory: x, y[, z], least s, then the derivatives by log f and alpha.
@@ -27,11 +22,10 @@ struct Rays {
 };
 #define MAX_RAY_ROWS 10
 
-// Fill the rays of a tile of a frame; thread p < TILE does cell p.
+// Fill the rays of a tile of a frame with intrinsics k; thread p < TILE does cell p.
 template <bool UNIFIED, bool FOCAL, bool ALPHA>
-__device__ inline void fill_rays(const Context& c, i64 state, int frame, i64 cell, int p, float* rays) {
+__device__ inline void fill_rays(const Context& c, const double* k, i64 cell, int p, float* rays) {
     using R = Rays<UNIFIED, FOCAL, ALPHA>;
-    const double* k = intrinsics_of(c, state, frame);
     const int width = (int)c.width;
     float mx = ((float)((int)cell % width) * (float)c.stride + (float)(c.offset - k[2])) / (float)k[0];
     float my = ((float)((int)cell / width) * (float)c.stride + (float)(c.offset - k[3])) / (float)k[1];

@@ -25,7 +25,7 @@ struct TileLayout {
     __device__ i64 products() const { return (i64)36 * items; }
 };
 
-#define FIXED_FLOATS (MAX_RAY_ROWS * TILE + 2 * TILE + TILE_WARPS * 4 * TILE)
+#define FIXED_FLOATS (20 + MAX_RAY_ROWS * TILE + 2 * TILE + TILE_WARPS * 4 * TILE)
 
 // Sum v[OFFSET ... OFFSET + N) over the lanes of a warp, N a power of two; lane l is left with number l % N. Recursive,
 // since an array stays in registers only where every index is known to the compiler.
@@ -94,7 +94,8 @@ __device__ inline void tile_pass(const Context& c, int first_unit, float* shared
     const int depth_free = c.unit_free[unit];
     const TileLayout at(count, depth_free);
 
-    float* rays = shared;
+    double* cameras = (double*)shared;  // (2, 5) intrinsics of the frame before and after the step
+    float* rays = shared + 20;
     float* depths = rays + MAX_RAY_ROWS * TILE;
     float* root_q = depths + TILE;
     float* tails = root_q + TILE;  // (warps, 4, TILE)
@@ -105,7 +106,10 @@ __device__ inline void tile_pass(const Context& c, int first_unit, float* shared
     float* edges = products + at.products();  // (count, STRIDE)
     for (i64 k = thread; k < at.products() + (i64)count * STRIDE; k += TILE_THREADS) products[k] = 0.0f;
 
-    Camera before = camera_of(c, now, frame), camera = camera_of(c, next, frame);
+    if (thread < 5) {
+        cameras[thread] = intrinsics_of(c, (int)now, frame)[thread];
+        cameras[5 + thread] = intrinsics_of(c, (int)next, frame)[thread];
+    }
     const float scale_now = (float)control.scale_system;
     const float scale_judge = (float)control.scale_judge, scale_next = (float)control.scale_next;
     const float c2_now = scale_now * scale_now, c2_judge = scale_judge * scale_judge;
@@ -128,7 +132,7 @@ __device__ inline void tile_pass(const Context& c, int first_unit, float* shared
                 prior_weight = c.prior_weight[(i64)frame * P + cell];
                 prior_value = prior_weight > 0.0f ? c.prior_value[(i64)frame * P + cell] : depth;
             }
-            fill_rays<UNIFIED, FOCAL, ALPHA>(c, step && depth_free ? now : next, frame, near, thread, rays);
+            fill_rays<UNIFIED, FOCAL, ALPHA>(c, cameras + (step && depth_free ? 0 : 5), near, thread, rays);
         }
         __syncthreads();
 
@@ -136,9 +140,9 @@ __device__ inline void tile_pass(const Context& c, int first_unit, float* shared
             float curvature[2] = {0.0f, 0.0f}, left[2] = {0.0f, 0.0f};
             for (int m = warp; m < count; m += TILE_WARPS) {
                 const i64 edge = first + m, row = (i64)c.edge_id[edge] * P;
-                const float* transform = c.edge_transform + (now * c.num_edges + edge) * 12;
+                const float* transform = c.edge_transform + (now * c.num_edges + edge) * EDGE_FLOATS;
+                const Camera before = camera_of(transform);
                 const float* twist = c.edge_twist + edge * 8;
-                if (c.num_cameras > 1) before = camera_of(c, now, c.edge_target[edge]);
 #pragma unroll
                 for (int h = 0; h < 2; ++h) {
                     const int p = lane + 32 * h;
@@ -197,7 +201,7 @@ __device__ inline void tile_pass(const Context& c, int first_unit, float* shared
                 depth = depth < low ? low : depth > high ? high : depth;
                 depths[thread] = depth;
                 if (real) c.depth[(next * c.num_frames + frame) * P + cell] = depth;
-                fill_rays<UNIFIED, FOCAL, ALPHA>(c, next, frame, real ? cell : P - 1, thread, rays);
+                fill_rays<UNIFIED, FOCAL, ALPHA>(c, cameras + 5, real ? cell : P - 1, thread, rays);
             }
             __syncthreads();
         }
@@ -209,8 +213,8 @@ __device__ inline void tile_pass(const Context& c, int first_unit, float* shared
             for (int k = 0; k < INTRINSICS + 2; ++k) tail[h][k] = 0.0f;
         for (int m = warp; m < count; m += TILE_WARPS) {
             const i64 edge = first + m, row = (i64)c.edge_id[edge] * P;
-            const float* transform = c.edge_transform + (next * c.num_edges + edge) * 12;
-            if (c.num_cameras > 1) camera = camera_of(c, next, c.edge_target[edge]);
+            const float* transform = c.edge_transform + (next * c.num_edges + edge) * EDGE_FLOATS;
+            const Camera camera = camera_of(transform);
             float sums[STRIDE];
 #pragma unroll
             for (int k = 0; k < STRIDE; ++k) sums[k] = 0.0f;
