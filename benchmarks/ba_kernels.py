@@ -2,7 +2,8 @@
 
 Compiles with NVRTC as the engine does, for compute capabilities 8.0, 9.0 and 12.0, and reads the assembler's report:
 registers, spilled bytes, stack, static shared memory, and the blocks of threads that a multiprocessor can hold by
-registers. No GPU is needed. Fails where anything spills.
+registers. No GPU is needed. Fails where anything spills, where a multiprocessor cannot hold the blocks that a pass over
+the cells is meant for, or where static shared memory is more than every GPU has.
 """
 
 from __future__ import annotations
@@ -17,11 +18,13 @@ from dataclasses import dataclass
 from rich.console import Console
 from rich.table import Table
 
-from vipe_core.ba.cuda.compiler import compile_kernels, specialisations, system_source, tile_source
+from vipe_core.ba.cuda.compiler import Specialisation, compile_kernels, specialisations, system_source, tile_source
 from vipe_core.ba.cuda.layout import TILE_THREADS
 
 ARCHITECTURES = ("sm_80", "sm_90", "sm_120")
 _REGISTERS = 65536
+_STATIC_SHARED_BYTES = 48 << 10
+_MOST_REGISTERS = 255
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,34 +61,48 @@ def usage(source: str, architecture: str) -> dict[str, Usage]:
     return found
 
 
-def rows(architecture: str) -> Iterable[tuple[str, Usage]]:
-    """Every kernel of every specialisation, each compiled by itself as the engine does."""
+def faults(name: str, used: Usage, kind: Specialisation | None = None) -> list[str]:
+    """What is wrong with a kernel, of a specialisation where it is a pass over the cells."""
+    found = [f"{used.spilled} bytes spilled"] if used.spilled else []
+    if used.shared > _STATIC_SHARED_BYTES:
+        found.append(f"{used.shared} bytes of static shared memory")
+    if used.registers > _MOST_REGISTERS:
+        found.append(f"{used.registers} registers")
+    if kind is not None and used.resident_blocks < kind.resident_blocks[name]:
+        found.append(f"{used.resident_blocks} blocks of threads, not {kind.resident_blocks[name]}")
+    if kind is not None and used.stack:
+        found.append(f"{used.stack} bytes of stack")
+    return found
+
+
+def rows(architecture: str) -> Iterable[tuple[str, Usage, list[str]]]:
+    """Every kernel of every specialisation, each compiled by itself as the engine does; and what is wrong with it."""
     for name, used in usage(system_source(), architecture).items():
-        yield name, used
+        yield name, used, faults(name, used)
     for kind in specialisations():
         camera = "unified" if kind.unified else "pinhole"
         free = "+".join(name for name, is_free in (("focal", kind.focal), ("alpha", kind.alpha)) if is_free) or "none"
         for name, used in usage(tile_source([kind]), architecture).items():
-            yield f"{name} {camera} {free} {kind.robust}", used
+            yield f"{name} {camera} {free} {kind.robust}", used, faults(name, used, kind)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     parser.add_argument("--arch", nargs="*", default=ARCHITECTURES, metavar="SM")
     arguments = parser.parse_args(argv)
-    console, spilled = Console(width=120), 0
+    console, wrong = Console(width=120), []
     for architecture in arguments.arch:
         table = Table(title=architecture)
         for heading in ("kernel", "registers", "spilled B", "stack B", "shared B", "blocks/SM"):
             table.add_column(heading, justify="left" if heading == "kernel" else "right")
-        for name, used in rows(architecture):
-            spilled += used.spilled
+        for name, used, found in rows(architecture):
+            wrong += [f"{architecture} {name}: {fault}" for fault in found]
             blocks = str(used.resident_blocks) if name.startswith("tile") else ""
             numbers = (used.registers, used.spilled, used.stack, used.shared)
             table.add_row(name, *map(str, numbers), blocks)
         console.print(table)
-    console.print("nothing spills" if not spilled else f"{spilled} bytes spilled")
-    return int(spilled > 0)
+    console.print("\n".join(wrong) or "nothing spills, and every pass has the blocks it is meant for")
+    return int(bool(wrong))
 
 
 if __name__ == "__main__":

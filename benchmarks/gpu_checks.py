@@ -133,7 +133,7 @@ def _rig_scene(focal: bool) -> tuple[Problem, State]:
         problem,
         edges=replace(edges, target_px=target_px, weight=edges.weight * valid[..., None]),
         free=free,
-        priors=replace(problem.priors, cam_from_rig=cam_from_rig, extrinsic_sigma=(0.1, 0.1)),
+        priors=replace(problem.priors, cam_from_rig=cam_from_rig, extrinsic_sigma=torch.full((3, 2), 0.1)),
         rig=rig,
     )
     away = se3.exp(0.005 * torch.randn(4, 6, generator=rng, dtype=torch.float64))[rig.pose_of_frame]

@@ -142,7 +142,8 @@ def test_a_rig_is_the_hosts(kind: Specialisation, own_intrinsics: bool, extrinsi
     free.inverse_depth[[1, 5]] = False
     assert truth.cam_from_rig is not None
     away = se3.exp(torch.full((1, 6), 0.01, dtype=torch.float64)) @ truth.cam_from_rig
-    priors = Priors(cam_from_rig=away if prior else None, extrinsic_sigma=(0.1, 0.05))
+    sigma = torch.tensor([[0.1, 0.05], [0.2, 0.03], [0.3, 0.02]])
+    priors = Priors(cam_from_rig=away, extrinsic_sigma=sigma) if prior else Priors()
     problem = replace(with_noise(problem, 0.05), free=free, priors=priors)
     problem, start = float32(problem, disturbed_rig(problem, truth, twist=0.01, turn=0.01 * extrinsics))
     options = Options(max_iterations=4, robust=kind.robust, robust_scale_px=8.0)

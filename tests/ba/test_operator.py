@@ -14,8 +14,8 @@ from ba_scenes import disturbed, float32, scene, with_depth_prior, with_noise
 from rig_scenes import disturbed_rig, rig_scene
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from vipe_core.ba import Options, Priors, Problem, State, Status, levenberg, solve
-from vipe_core.ba.answer import answer_of, result_of
+from vipe_core.ba import Options, Priors, Problem, Result, State, Status, levenberg, solve
+from vipe_core.ba.answer import answer_of, report_size, result_of
 
 
 def plain() -> tuple[Problem, State]:
@@ -27,7 +27,8 @@ def plain() -> tuple[Problem, State]:
 
 def rig() -> tuple[Problem, State]:
     problem, truth = rig_scene(num_poses=3, own_intrinsics=True, height=3, width=4)
-    prior = Priors(log_focal=(3.0, 3.1), cam_from_rig=truth.cam_from_rig, extrinsic_sigma=(0.1, 0.2))
+    sigma = torch.tensor([[0.1, 0.2], [0.3, 0.4]])
+    prior = Priors(log_focal=(3.0, 3.1), cam_from_rig=truth.cam_from_rig, extrinsic_sigma=sigma)
     free = replace(problem.free, focal=True, extrinsics=True)
     return replace(with_noise(problem, 0.05), free=free, priors=prior), disturbed_rig(problem, truth)
 
@@ -100,7 +101,9 @@ def _equal(one: Any, other: Any) -> bool:
 def test_an_answer_says_what_the_result_does(case: Any) -> None:
     problem, state = case()
     result = levenberg.descend(problem, state, Options(max_iterations=2))
-    again = result_of(answer_of(result), state)
-    assert _equal(again, result)
+    size = report_size(problem, state)
+    assert _equal(result_of(answer_of(result, size), state), result)
     for status in (Status.EMPTY, Status.NON_FINITE):
-        assert result_of(answer_of(replace(result, status=status)), state).state is state
+        nothing = Result(state, status, 0, 1.0, 1.0, 1.0)
+        assert len(answer_of(nothing, size).report) == size
+        assert result_of(answer_of(nothing, size), state).state is state

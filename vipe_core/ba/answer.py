@@ -8,7 +8,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from vipe_core.ba.problem import Covariance, Result, State, Status
+from vipe_core.ba.problem import Covariance, Problem, Result, State, Status
 
 _STATUS = tuple(Status)
 _NUMBERS = 5
@@ -21,7 +21,7 @@ class Answer(NamedTuple):
         cam_from_world, inverse_depth, intrinsics: As in `State`.
         cam_from_rig: (V, 4, 4); (0, 4, 4) without a rig.
         report: (5 + 4 C,) float64 for C cameras: number of the status in `Status`, steps tried, cost before and after,
-            weight, and the covariances of log f and alpha row by row.
+            weight, and the covariances of log f and alpha row by row; then (36 V,) those of refined extrinsics.
     """
 
     cam_from_world: Tensor
@@ -31,24 +31,31 @@ class Answer(NamedTuple):
     report: Tensor
 
 
-def report_size(state: State) -> int:
-    """Numbers in a report."""
-    return _NUMBERS + 4 * (1 if state.intrinsics.ndim == 1 else len(state.intrinsics))
+def _num_cameras(state: State) -> int:
+    return 1 if state.intrinsics.ndim == 1 else len(state.intrinsics)
 
 
-def answer_of(result: Result) -> Answer:
-    """A result as an answer; nothing of it is shared."""
-    state = result.state
-    covariances = [value for covariance in result.intrinsics_covariances for row in covariance for value in row]
-    # Where nothing was solved there is only one.
-    covariances += [0.0] * (report_size(state) - _NUMBERS - len(covariances))
+def report_size(problem: Problem, state: State, *, extrinsics: bool = True) -> int:
+    """Numbers in a report, or without what it says of extrinsics."""
+    refined = len(state.cam_from_rig) if extrinsics and problem.refines_rig and state.cam_from_rig is not None else 0
+    return _NUMBERS + 4 * _num_cameras(state) + 36 * refined
+
+
+def answer_of(result: Result, size: int) -> Answer:
+    """A result as an answer with a report of a size; nothing of it is shared."""
+    state, device = result.state, result.state.inverse_depth.device
     numbers = [_STATUS.index(result.status), result.iterations, result.initial_cost, result.cost, result.weight_sum]
+    numbers += [value for covariance in result.intrinsics_covariances for row in covariance for value in row]
+    if result.extrinsic_covariances is not None:
+        numbers += result.extrinsic_covariances.flatten().tolist()
+    # Where nothing was solved there is less to say.
+    numbers += [0.0] * (size - len(numbers))
     return Answer(
         state.cam_from_world.clone(),
         state.inverse_depth.clone(),
         state.intrinsics.clone(),
         state.cam_from_world.new_empty(0, 4, 4) if state.cam_from_rig is None else state.cam_from_rig.clone(),
-        torch.tensor([*numbers, *covariances], dtype=torch.float64, device=state.inverse_depth.device),
+        torch.tensor(numbers, dtype=torch.float64, device=device),
     )
 
 
@@ -62,14 +69,18 @@ def result_of(answer: Answer, given: State) -> Result:
         answer.intrinsics,
         None if given.cam_from_rig is None else answer.cam_from_rig,
     )
+    solved = status not in (Status.NON_FINITE, Status.EMPTY)
+    rest = _NUMBERS + 4 * _num_cameras(given)
+    extrinsic = torch.tensor(report[rest:], dtype=torch.float64).view(-1, 6, 6)
     return Result(
-        given if status in (Status.NON_FINITE, Status.EMPTY) else state,
+        state if solved else given,
         status,
         iterations=int(report[1]),
         initial_cost=report[2],
         cost=report[3],
         weight_sum=report[4],
-        intrinsics_covariances=_covariances(report[_NUMBERS:]),
+        intrinsics_covariances=_covariances(report[_NUMBERS:rest]),
+        extrinsic_covariances=extrinsic if solved and len(extrinsic) else None,
     )
 
 

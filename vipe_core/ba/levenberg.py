@@ -69,7 +69,7 @@ def descend(problem: Problem, state: State, options: Options) -> Result:
     status = descent.run()
 
     covariances = _intrinsics_covariances(solver, descent) if any(solver.intrinsics_free) else (NO_COVARIANCE,)
-    extrinsic = _extrinsic_covariances(solver, descent) if problem.rig and problem.free.extrinsics else None
+    extrinsic = _extrinsic_covariances(solver, descent.system()).cpu() if problem.refines_rig else None
     measured, weight = _read(descent.cost.measurements, descent.cost.weight)
     return Result(descent.state, status, descent.iterations, initial_cost, measured, weight, covariances, extrinsic)
 
@@ -90,9 +90,16 @@ def _intrinsics_covariances(solver: Solver[Any], descent: _Descent) -> tuple[Cov
     return tuple(chosen)
 
 
-def _extrinsic_covariances(solver: Solver[Any], descent: _Descent) -> Tensor:
-    """Of each camera of a rig, likewise."""
-    return _sound([solver.extrinsic_covariance(descent.system(), damping) for damping in _SIGMA_DAMPINGS])
+def _extrinsic_covariances(solver: Solver[Any], system: Any) -> Tensor:
+    """(V, 6, 6) of each camera of a rig, likewise."""
+    return _sound([solver.extrinsic_covariance(system, damping) for damping in _SIGMA_DAMPINGS])
+
+
+def extrinsic_covariances(problem: Problem, state: State, options: Options) -> Tensor:
+    """`Result.extrinsic_covariances` of a state that was solved for, on the device of the problem."""
+    problem, state = _on_device(problem, state)
+    solver = _solver(problem, options, state)
+    return _extrinsic_covariances(solver, solver.linearise(state, options.robust_scale_px))
 
 
 def pose_covariance(problem: Problem, state: State, frame: int, options: Options | None = None) -> Tensor:
@@ -109,18 +116,19 @@ def pose_covariance(problem: Problem, state: State, frame: int, options: Options
         ConfigError, ValueError: As `solve`.
     """
     options = options or Options()
+    require_solvable(problem, state)
     problem, state = _on_device(problem, state)
     solver = _solver(problem, options, state)
     system = solver.linearise(state, options.robust_scale_px)
-    return _sound([solver.pose_covariance(system, damping, frame)[None] for damping in _SIGMA_DAMPINGS])[0]
+    return _sound([solver.pose_covariance(system, damping, frame)[None] for damping in _SIGMA_DAMPINGS])[0].cpu()
 
 
 def _sound(by_damping: Sequence[Tensor]) -> Tensor:
     """(G, n, n) covariances, each by the least damping at which the system could be solved; NaN if by none."""
-    found = torch.stack(tuple(by_damping)).cpu()
+    found = torch.stack(tuple(by_damping))
     sound = (found.diagonal(dim1=-2, dim2=-1) >= 0).all(-1)
     first = sound.int().argmax(0)
-    chosen = found[first, torch.arange(found.shape[1])]
+    chosen = found[first, torch.arange(found.shape[1], device=found.device)]
     return torch.where(sound.any(0)[:, None, None], chosen, torch.nan)
 
 

@@ -64,7 +64,8 @@ def solve(problem: Problem, state: State, options: Options | None = None) -> Res
         None if priors.inverse_depth_weight is None else priors.inverse_depth_weight.to(device),
         [] if log_focal is None else list(log_focal) if isinstance(log_focal, tuple) else [log_focal],
         priors.cam_from_rig,
-        [priors.log_focal_sigma, *priors.extrinsic_sigma],
+        priors.log_focal_sigma,
+        priors.extrinsic_sigma,
         None if rig is None else rig.pose_of_frame.cpu(),
         None if rig is None else rig.view_of_frame.cpu(),
         state.cam_from_world.to(device),
@@ -101,7 +102,8 @@ def _problem(
     prior_depth_weight: Tensor | None,
     prior_log_focal: Sequence[float],
     prior_cam_from_rig: Tensor | None,
-    prior_sigmas: Sequence[float],
+    prior_log_focal_sigma: float,
+    prior_extrinsic_sigma: Tensor | None,
     pose_of_frame: Tensor | None,
     view_of_frame: Tensor | None,
     cam_from_world: Tensor,
@@ -125,9 +127,9 @@ def _problem(
             prior_depth,
             prior_depth_weight,
             None if not log_focal else log_focal[0] if len(log_focal) == 1 else log_focal,
-            prior_sigmas[0],
+            prior_log_focal_sigma,
             prior_cam_from_rig,
-            (prior_sigmas[1], prior_sigmas[2]),
+            prior_extrinsic_sigma,
         ),
         None if pose_of_frame is None or view_of_frame is None else Rig(pose_of_frame, view_of_frame),
     )
@@ -149,7 +151,8 @@ def _problem(
 _SCHEMA = (
     "(str camera_model, int[] grid_cells, float[] grid_px, Tensor source, Tensor target, Tensor target_px, "
     "Tensor weight, Tensor free_poses, Tensor free_depths, bool[] free, Tensor? prior_depth, "
-    "Tensor? prior_depth_weight, float[] prior_log_focal, Tensor? prior_cam_from_rig, float[] prior_sigmas, "
+    "Tensor? prior_depth_weight, float[] prior_log_focal, Tensor? prior_cam_from_rig, "
+    "float prior_log_focal_sigma, Tensor? prior_extrinsic_sigma, "
     "Tensor? pose_of_frame, Tensor? view_of_frame, Tensor cam_from_world, Tensor inverse_depth, Tensor intrinsics, "
     "Tensor? cam_from_rig, str robust, int max_iterations, float? initial_scale_px, float[] settings) "
     "-> (Tensor cam_from_world, Tensor inverse_depth, Tensor intrinsics, Tensor cam_from_rig, Tensor report)"
@@ -159,23 +162,34 @@ _SCHEMA = (
 @torch.library.custom_op("vipe_core::bundle_adjustment", mutates_args=(), device_types="cpu", schema=_SCHEMA)
 def bundle_adjustment(*arguments: Any) -> Answer:
     """Arguments as of `_problem`. The graph and what is free are on the host, all else where the inverse depths are."""
-    return answer_of(levenberg.descend(*_problem(*arguments)))
+    return _descended(*_problem(*arguments))
+
+
+def _descended(problem: Problem, state: State, options: Options) -> Answer:
+    return answer_of(levenberg.descend(problem, state, options), report_size(problem, state))
 
 
 @bundle_adjustment.register_kernel("cuda")
 def _on_gpu(*arguments: Any) -> Answer:
-    given = _problem(*arguments)
-    answer = cuda.solve(*given) if cuda.takes(*given[:2]) else None
-    return answer_of(levenberg.descend(*given)) if answer is None else answer
+    problem, state, options = _problem(*arguments)
+    answer = cuda.solve(problem, state, options) if cuda.takes(problem, state) else None
+    if answer is None:
+        return _descended(problem, state, options)
+    if not problem.refines_rig:
+        return answer
+    # Of extrinsics that are refined, the kernels leave it to torch to say how sure they are.
+    solved = State(answer.cam_from_world, answer.inverse_depth, answer.intrinsics, answer.cam_from_rig)
+    covariances = levenberg.extrinsic_covariances(problem, solved, options)
+    return answer._replace(report=torch.cat((answer.report, covariances.flatten())))
 
 
 @bundle_adjustment.register_fake
 def _shapes(*arguments: Any) -> Answer:
-    _, state, _ = _problem(*arguments)
+    problem, state, _ = _problem(*arguments)
     return Answer(
         torch.empty_like(state.cam_from_world),
         torch.empty_like(state.inverse_depth),
         torch.empty_like(state.intrinsics),
         state.cam_from_world.new_empty(0, 4, 4) if state.cam_from_rig is None else torch.empty_like(state.cam_from_rig),
-        state.inverse_depth.new_empty(report_size(state), dtype=torch.float64),
+        state.inverse_depth.new_empty(report_size(problem, state), dtype=torch.float64),
     )

@@ -176,6 +176,11 @@ class Problem:
     priors: Priors = field(default_factory=Priors)
     rig: Rig | None = None
 
+    @property
+    def refines_rig(self) -> bool:
+        """Whether the extrinsics of a rig are among the unknowns."""
+        return self.rig is not None and self.free.extrinsics
+
 
 @dataclass(frozen=True, slots=True)
 class Options:

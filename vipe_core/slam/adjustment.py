@@ -349,8 +349,8 @@ class Adjuster:
             grid=keyframes.grid,
             edges=measured,
             free=Free(
-                poses=torch.tensor([keyframes.instant(k) not in held for k in frames], device=self.device),
-                inverse_depth=torch.full((len(frames),), free_depth, dtype=torch.bool, device=self.device),
+                poses=torch.tensor([keyframes.instant(k) not in held for k in frames]),
+                inverse_depth=torch.full((len(frames),), free_depth, dtype=torch.bool),
                 focal=free_focal,
                 distortion=free_focal and not self.focal_prior.same_lens,
             ),

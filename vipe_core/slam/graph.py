@@ -97,7 +97,7 @@ class Graph:
     def read(
         self, edges: list[tuple[int, int]], number: Mapping[int, int], keyframes: KeyframeMap, device: torch.device
     ) -> Edges:
-        """`edges` for the solver, with the moving cells of the source masked out.
+        """`edges` for the solver, what they measured on a device, with the moving cells of the source masked out.
 
         Args:
             number: Keyframe number -> frame number of the problem.
@@ -110,8 +110,8 @@ class Graph:
             target_px[row] = match.target_px
             np.multiply(match.weight, keyframes.static(i)[:, None], out=weight[row])
         return Edges(
-            source=torch.tensor([number[i] for i, _ in edges], dtype=torch.int64, device=device),
-            target=torch.tensor([number[j] for _, j in edges], dtype=torch.int64, device=device),
+            source=torch.tensor([number[i] for i, _ in edges], dtype=torch.int64),
+            target=torch.tensor([number[j] for _, j in edges], dtype=torch.int64),
             target_px=torch.from_numpy(target_px).to(device),
             weight=torch.from_numpy(weight).to(device),
         )

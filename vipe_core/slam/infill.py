@@ -317,8 +317,8 @@ class _ShotInfill:
         agreed = [cells for frame in pending for cells in frame.agreed]
         weight = np.stack([match.weight * cells[:, None] for (_, _, match), cells in zip(links, agreed, strict=True)])
         edges = Edges(
-            source=torch.tensor([i for i, _, _ in links], dtype=torch.int64, device=device),
-            target=torch.tensor([j for _, j, _ in links], dtype=torch.int64, device=device),
+            source=torch.tensor([i for i, _, _ in links], dtype=torch.int64),
+            target=torch.tensor([j for _, j, _ in links], dtype=torch.int64),
             target_px=torch.from_numpy(np.stack([match.target_px for _, _, match in links])).to(device),
             weight=torch.from_numpy(weight).to(device),
         )
@@ -330,8 +330,8 @@ class _ShotInfill:
             grid=self._keyframes.grid,
             edges=edges,
             free=Free(
-                poses=torch.arange(total, device=device) >= first,
-                inverse_depth=torch.zeros(total, dtype=torch.bool, device=device),
+                poses=torch.arange(total) >= first,
+                inverse_depth=torch.zeros(total, dtype=torch.bool),
             ),
         )
         state = State(

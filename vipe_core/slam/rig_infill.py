@@ -224,8 +224,8 @@ class _RigInfill:
         total = first + len(pending) * views
         links = [(first + row * views, sighting) for row, one in enumerate(pending) for sighting in one.sightings]
         edges = Edges(
-            source=torch.tensor([number[sighting.keyframe] for _, sighting in links], device=device),
-            target=torch.tensor([at + sighting.view for at, sighting in links], device=device),
+            source=torch.tensor([number[sighting.keyframe] for _, sighting in links]),
+            target=torch.tensor([at + sighting.view for at, sighting in links]),
             target_px=torch.from_numpy(np.stack([sighting.match.target_px for _, sighting in links])).to(device),
             weight=torch.from_numpy(
                 np.stack([sighting.match.weight * sighting.usable[:, None] for _, sighting in links])
@@ -246,8 +246,8 @@ class _RigInfill:
             grid=keyframes.grid,
             edges=edges,
             free=Free(
-                poses=torch.arange(total, device=device) >= first,
-                inverse_depth=torch.zeros(total, dtype=torch.bool, device=device),
+                poses=torch.arange(total) >= first,
+                inverse_depth=torch.zeros(total, dtype=torch.bool),
             ),
             rig=rig,
         )

@@ -39,14 +39,19 @@ class Specialisation:
     alpha: bool
     robust: RobustKernel
 
+    @property
+    def resident_blocks(self) -> dict[str, int]:
+        """Blocks of threads of each kernel that a multiprocessor should hold: at most 65536 / 128 / blocks registers
+        per thread."""
+        return dict(zip(TILE_KERNELS, (3 if self.alpha else 4, 3), strict=True))
+
     def definition(self, suffix: str = "") -> str:
         """The two kernels of this specialisation; their names end in `suffix`."""
         flags = ", ".join(str(flag).lower() for flag in (self.unified, self.focal, self.alpha))
-        # Blocks of threads that a multiprocessor should hold, which bounds registers to 65536 / 128 / blocks.
-        kernels = zip(TILE_KERNELS, ("false", "true"), (3 if self.alpha else 4, 3), strict=True)
+        kernels = zip(self.resident_blocks.items(), ("false", "true"), strict=True)
         return "".join(
             f"DEFINE_TILE_KERNEL({name}{suffix}, {flags}, {ROBUST_CODE[self.robust]}, {large}, {blocks})\n"
-            for name, large, blocks in kernels
+            for (name, blocks), large in kernels
         )
 
 

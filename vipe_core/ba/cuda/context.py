@@ -11,10 +11,10 @@ _SIZES = (
 )
 _SETTINGS = (
     "stride offset robust_scale first_scale tolerance initial_damping min_damping min_depth_ratio "
-    "min_depth max_depth log_focal log_focal_information place_sigma rotation_sigma"
+    "min_depth max_depth log_focal log_focal_information"
 )
 _ADDRESSES = (
-    "target_px weight prior_value prior_weight finite median largest prior_view "
+    "target_px weight prior_value prior_weight finite median largest prior_view prior_sigma "
     "pose depth intrinsics view "
     "frame_node frame_view frame_camera view_node node_view "
     "edge_id edge_source edge_target edge_transform edge_adjoint edge_twist pose_step "

@@ -91,8 +91,9 @@ class Adjustment:
         if self._has_prior and priors.inverse_depth is not None and priors.inverse_depth_weight is not None:
             tensors["prior_value"] = self._input(priors.inverse_depth)
             tensors["prior_weight"] = self._input(priors.inverse_depth_weight)
-        if priors.cam_from_rig is not None and self._has_view_prior:
-            tensors["prior_view"] = priors.cam_from_rig.to(self._device, double).contiguous()
+        if priors.cam_from_rig is not None and priors.extrinsic_sigma is not None and self._has_view_prior:
+            for name, given in (("prior_view", priors.cam_from_rig), ("prior_sigma", priors.extrinsic_sigma)):
+                tensors[name] = given.to(self._device, double, non_blocking=True).contiguous()
         sides, tiles = layout.num_sides, layout.num_tiles
         large_blocks = layout.num_large * self._slices
         shapes: dict[str, tuple[torch.dtype, tuple[int, ...]]] = {
@@ -117,7 +118,7 @@ class Adjustment:
             "scale": (double, (sides * SIDE,)),
             "solution": (double, (sides * SIDE,)),
             "control": (torch.uint8, (CONTROL_BYTES,)),
-            "report": (double, (report_size(self._state),)),
+            "report": (double, (report_size(self._problem, self._state, extrinsics=False),)),
         }
         for name, (dtype, shape) in shapes.items():
             tensors[name] = torch.empty(shape, dtype=dtype, device=self._device)
@@ -185,8 +186,6 @@ class Adjustment:
             max_depth=options.max_inverse_depth,
             log_focal=log_focal or 0.0,
             log_focal_information=information,
-            place_sigma=priors.extrinsic_sigma[0],
-            rotation_sigma=priors.extrinsic_sigma[1],
         )
         for name, tensor in self._tensors.items():
             setattr(context, name, tensor.data_ptr())
@@ -285,7 +284,7 @@ class Adjustment:
     # -- answer ----------------------------------------------------------------------------------------------------
 
     def answer(self) -> Answer:
-        """What the last `run` leaves; copies, so another one may follow."""
+        """What the last `run` leaves; copies, so another one may follow. Nothing is said of how sure extrinsics are."""
         tensors, given = self._tensors, self._state
         views = tensors["view"][0].view(-1, 4, 4)
         return Answer(

@@ -116,8 +116,8 @@ class RefinedEdges:
         frames = sorted({k for edge in pairs for k in edge})
         number = {k: row for row, k in enumerate(frames)}
         state = self._state(frames)
-        device = self._adjuster.device
-        ends = torch.tensor([[number[i], number[j]] for i, j in pairs], dtype=torch.int64, device=device)
+        # The graph stays on the host, where it is laid out: a solve waits for the GPU only for its answer.
+        ends = torch.tensor([[number[i], number[j]] for i, j in pairs], dtype=torch.int64)
         measured = [(self._target_px, self._weight)]
         if again:
             said = [self.stored[edge] for edge in again]
@@ -135,8 +135,8 @@ class RefinedEdges:
                 weight=torch.cat([weight for _, weight in measured]),
             ),
             free=Free(
-                poses=torch.tensor([k >= first_free for k in frames], device=device),
-                inverse_depth=torch.ones(len(frames), dtype=torch.bool, device=device),
+                poses=torch.tensor([k >= first_free for k in frames]),
+                inverse_depth=torch.ones(len(frames), dtype=torch.bool),
                 focal=free_focal,
                 distortion=free_focal and not prior.same_lens,
             ),

@@ -68,17 +68,14 @@ class FramePoser:
         number = {k: row for row, k in enumerate(sources)}
         first, total = len(sources), len(sources) + len(frames)
         edges = [(k, row) for row, frame in enumerate(frames) for k in frame.sources]
-        ends = torch.tensor([[number[k], first + row] for k, row in edges], dtype=torch.int64, device=device)
+        ends = torch.tensor([[number[k], first + row] for k, row in edges], dtype=torch.int64)
         source, target = ends[:, 0].contiguous(), ends[:, 1].contiguous()
         depths = np.ones((total, keyframes.grid.num_cells), dtype=np.float32)
         depths[:first] = np.stack([keyframes.depth(k) for k in sources])
         poses = np.stack([*(keyframes.pose(k) for k in sources), *(frame.start for frame in frames)])
         state = self._adjuster.state(poses, depths, keyframes.intrinsics)
         kept = torch.from_numpy(np.stack([self._usable[k] for k, _ in edges])).to(device)
-        free = Free(
-            poses=torch.arange(total, device=device) >= first,
-            inverse_depth=torch.zeros(total, dtype=torch.bool, device=device),
-        )
+        free = Free(poses=torch.arange(total) >= first, inverse_depth=torch.zeros(total, dtype=torch.bool))
         refinement = self._refiner.begin(keyframes.grid, lean=self._settings.lean)
         step = Step("none", 1.0, self._settings.iterations, 1e-4)
         for update in range(self._settings.fill_updates):

@@ -75,7 +75,7 @@ struct Context {
     i64 views_free, has_view_prior;
     i64 num_pool;        // blocks of `pool` in each of its parts
     double stride, offset, robust_scale, first_scale, tolerance, initial_damping, min_damping, min_depth_ratio;
-    double min_depth, max_depth, log_focal, log_focal_information, place_sigma, rotation_sigma;
+    double min_depth, max_depth, log_focal, log_focal_information;
 
     // The problem. Pixels and weights are (E, P, 2), in the order that they came in.
     const float* target_px;
@@ -87,6 +87,7 @@ struct Context {
     float* largest;               // (E) argument of the robust kernel, px^2
 
     const double* prior_view;     // (V, 16)
+    const double* prior_sigma;    // (V, 2) of place and rotation
 
     // The state, twice: poses (2, N, 16), inverse depths (2, N, P), intrinsics (2, C, 5), cam_from_rig (2, V, 16).
     double* pose;

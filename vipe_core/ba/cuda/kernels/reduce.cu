@@ -151,6 +151,7 @@ extern "C" __global__ void __launch_bounds__(WIDE_THREADS) turn(const Context c)
 __device__ inline void view_prior(const Context& c, i64 state, int view, double* residual, double (*jacobian)[6]) {
     const double* now = c.view + (state * c.num_views + view) * 16;
     const double* prior = c.prior_view + view * 16;
+    const double place_sigma = c.prior_sigma[2 * view], rotation_sigma = c.prior_sigma[2 * view + 1];
     double r[3][3], t[3], trace = 0;
     for (int i = 0; i < 3; ++i) {
         t[i] = now[4 * i + 3];
@@ -162,13 +163,13 @@ __device__ inline void view_prior(const Context& c, i64 state, int view, double*
     }
     for (int i = 0; i < 3; ++i) {
         const int j = (i + 1) % 3, k = (i + 2) % 3;
-        residual[i] = t[i] / c.place_sigma;
-        residual[3 + i] = (r[k][j] - r[j][k]) / (2 * c.rotation_sigma);
+        residual[i] = t[i] / place_sigma;
+        residual[3 + i] = (r[k][j] - r[j][k]) / (2 * rotation_sigma);
         for (int q = 0; q < 3; ++q) {
-            jacobian[i][q] = (i == q) / c.place_sigma;
-            jacobian[i][3 + q] = (q == j ? t[k] : q == k ? -t[j] : 0) / c.place_sigma;
+            jacobian[i][q] = (i == q) / place_sigma;
+            jacobian[i][3 + q] = (q == j ? t[k] : q == k ? -t[j] : 0) / place_sigma;
             jacobian[3 + i][q] = 0;
-            jacobian[3 + i][3 + q] = ((i == q) * trace - r[i][q]) / (2 * c.rotation_sigma);
+            jacobian[3 + i][3 + q] = ((i == q) * trace - r[i][q]) / (2 * rotation_sigma);
         }
     }
 }
