@@ -1,10 +1,13 @@
 """What a rig makes of its views, against the best of them by itself: rendered recordings with exact truth.
 
-    python -m benchmarks.rigs [CASE ...] [--frames N] [--json FILE]
+    python -m benchmarks.rigs [CASE ...] [--frames N] [--draws N] [--json FILE]
 
-`ring` is four cameras back to back that do not overlap, `stereo` two side by side. Each is annotated view by view, as a
-rig with the extrinsics as they are, and as a rig whose extrinsics but the first are turned by two degrees and refined.
-Poses only. Rigs are given their cameras. Errors of the scale are of the metres that the size of the rig tells.
+`ring` is four cameras back to back that do not overlap, `stereo` two side by side, `bent` two fisheye lenses side by
+side, and `straight` the ring on a path without a turn, which leaves extrinsics unobserved. Each is annotated view by
+view (the best counts), as a rig with the extrinsics as they are, and with all extrinsics but the first turned by two
+degrees about random axes: held as they were given, and refined, once per draw of the axes. Poses only. Rigs are given
+their cameras. Errors of the scale are of the metres that the size of the rig tells; the sigma is that of the worst
+extrinsic rotation.
 """
 
 from __future__ import annotations
@@ -13,7 +16,7 @@ import argparse
 import json
 import math
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
@@ -25,11 +28,11 @@ from rich.table import Table
 from scipy.spatial.transform import Rotation
 
 from benchmarks.cpu_time import cpu_s
-from vipe_core.annotation import Annotation
+from vipe_core.annotation import Annotation, Quality, Reliability
 from vipe_core.cameras import Camera
 from vipe_core.cameras.calibration import Calibration
 from vipe_core.cameras.rig import Rig, RigView, angle_between_deg
-from vipe_core.evaluation.synthetic.clip import SyntheticClip, render_rig
+from vipe_core.evaluation.synthetic.clip import SyntheticClip, render_rig, sample_camera
 from vipe_core.evaluation.synthetic.paths import handheld, look_at, through
 from vipe_core.evaluation.synthetic.scenes import room_scene
 from vipe_core.geometry import umeyama
@@ -40,7 +43,7 @@ from vipe_core.video.source import Frame, FrameStream, VideoInfo
 _WIDTH, _HEIGHT, _FPS = 256, 192, 24.0
 _NOISE = 2.0
 _WRONG_DEG = 2.0
-CASES = ("ring", "stereo")
+CASES = ("ring", "stereo", "bent", "straight")
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,6 +54,8 @@ class RigRun:
         ate_percent: Of the worst view of the run, of its path.
         scale_error_percent: None where the scale is relative.
         extrinsic_error_deg: Of the worst view; None without a rig.
+        extrinsic_sigma_deg: As the result states it, of the worst view; None where extrinsics were not refined.
+        verdict: Of the worst view, with its reasons.
     """
 
     case: str
@@ -59,6 +64,7 @@ class RigRun:
     scale: str
     scale_error_percent: float | None
     extrinsic_error_deg: float | None
+    extrinsic_sigma_deg: float | None
     verdict: str
     cpu_s_per_frame: float
 
@@ -81,19 +87,20 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     parser.add_argument("cases", nargs="*", default=CASES, metavar="CASE", help=f"of {', '.join(CASES)}")
     parser.add_argument("--frames", type=int, default=40)
+    parser.add_argument("--draws", type=int, default=3, help="of the axes that extrinsics are turned about")
     parser.add_argument("--json", type=Path, help="also write the figures to this file")
     arguments = parser.parse_args(argv)
     table = Table(title="Rigs")
     for column in ("case", "run"):
         table.add_column(column)
-    for column in ("ATE %", "scale off %", "extrinsics off deg", "CPU-s/frame"):
+    for column in ("ATE %", "scale off %", "extrinsics off deg", "sigma deg", "CPU-s/frame"):
         table.add_column(column, justify="right")
     table.add_column("reliable")
     runs: list[RigRun] = []
     for case in arguments.cases:
         if case not in CASES:
             parser.error(f"unknown case {case!r}; known: {', '.join(CASES)}")
-        for run in _runs(case, arguments.frames):
+        for run in _runs(case, arguments.frames, arguments.draws):
             print(f"{run.case} {run.run}: ATE {run.ate_percent:.4f} %", file=sys.stderr, flush=True)
             table.add_row(
                 run.case,
@@ -101,6 +108,7 @@ def main(argv: Sequence[str] | None = None) -> int:
                 f"{run.ate_percent:.3f}",
                 "relative" if run.scale_error_percent is None else f"{run.scale_error_percent:.2f}",
                 "" if run.extrinsic_error_deg is None else f"{run.extrinsic_error_deg:.3f}",
+                "" if run.extrinsic_sigma_deg is None else f"{run.extrinsic_sigma_deg:.3f}",
                 f"{run.cpu_s_per_frame:.2f}",
                 run.verdict,
             )
@@ -112,29 +120,36 @@ def main(argv: Sequence[str] | None = None) -> int:
     return 0
 
 
-def _runs(case: str, num_frames: int) -> list[RigRun]:
-    mounts = _ring(4, 0.15) if case == "ring" else _pair(0.12)
-    camera = Camera.pinhole_from_fov(80.0 if case == "ring" else 70.0, _WIDTH, _HEIGHT)
-    clips = render_rig(room_scene(), [camera] * len(mounts), mounts, _path(num_frames), fps=_FPS, noise=_NOISE)
+def _runs(case: str, num_frames: int, draws: int) -> Iterator[RigRun]:
+    mounts = _pair(0.12) if case in ("stereo", "bent") else _ring(4, 0.15)
+    fov_deg = 70.0 if case == "stereo" else 80.0
+    camera = Camera.pinhole_from_fov(fov_deg, _WIDTH, _HEIGHT)
+    if case == "bent":
+        camera = sample_camera("opencv_fisheye", _WIDTH, _HEIGHT)
+    path = _straight(num_frames) if case == "straight" else _path(num_frames)
+    clips = render_rig(room_scene(), [camera] * len(mounts), mounts, path, fps=_FPS, noise=_NOISE)
     known = Calibration(camera)
     rig = Rig(tuple(RigView(f"view{k}", mount, known) for k, mount in enumerate(mounts)), metric=True)
     sources = [_InMemory(view.name, clip) for view, clip in zip(rig.views, clips, strict=True)]
     annotator = RigAnnotator(threads=1)
-    alone = [_alone(annotator, case, source, clip) for source, clip in zip(sources, clips, strict=True)]
-    best = min(alone, key=lambda run: run.ate_percent)
-    found = [best, _together(annotator, case, "rig, extrinsics as they are", rig, mounts, sources, clips)]
-    wrong = replace(rig, views=tuple(map(_turned, range(len(mounts)), rig.views)), refine=True)
-    name = f"rig, extrinsics {_WRONG_DEG:g} deg off, refined"
-    return [*found, _together(annotator, case, name, wrong, mounts, sources, clips)]
+    alone = [_alone(annotator, case, source, clip, known) for source, clip in zip(sources, clips, strict=True)]
+    yield min(alone, key=lambda run: run.ate_percent)
+    yield _together(annotator, case, "rig, extrinsics as they are", rig, mounts, sources, clips)
+    for draw in range(draws):
+        turned = [_turned(number, view, draw) for number, view in enumerate(rig.views)]
+        for done, refine in (("held", False), ("refined", True)):
+            name = f"{_WRONG_DEG:g} deg off, {done}, draw {draw}"
+            wrong = replace(rig, views=tuple(turned), refine=refine)
+            yield _together(annotator, case, name, wrong, mounts, sources, clips)
 
 
-def _alone(annotator: RigAnnotator, case: str, source: _InMemory, clip: SyntheticClip) -> RigRun:
+def _alone(annotator: RigAnnotator, case: str, source: _InMemory, clip: SyntheticClip, known: Calibration) -> RigRun:
     before = cpu_s()
-    annotation = annotator.annotate(source)
+    annotation = annotator.annotate(source, calibration=known if known.camera.distorted else None)
     per_frame = (cpu_s() - before) / annotation.num_frames
     name = f"best view alone ({source.info.name})"
     ate = _ate_percent(annotation, clip)[0]
-    return RigRun(case, name, ate, annotation.scale, None, None, annotation.quality.reliable, per_frame)
+    return RigRun(case, name, ate, annotation.scale, None, None, None, annotation.quality.reliable, per_frame)
 
 
 def _together(
@@ -161,7 +176,8 @@ def _together(
         found.views[0].scale,
         scale_error,
         max(map(angle_between_deg, between, truth)),
-        found.views[0].quality.reliable,
+        max((view.sigma.rotation_deg for view in found.rig.views if view.sigma), default=None),
+        _worst([view.quality for view in found.views]),
         per_frame,
     )
 
@@ -183,6 +199,19 @@ def _path(num_frames: int) -> NDArray[np.float64]:
     return handheld(look_at(eye, eye + ahead), shift_m=0.004, angle_deg=0.3, seed=1)
 
 
+def _straight(num_frames: int) -> NDArray[np.float64]:
+    """(N, 4, 4) world_from_rig: ahead on a line."""
+    eye = np.linspace((1.5, 1.5, 1.3), (3.9, 2.3, 1.3), num_frames)
+    return look_at(eye, eye + (eye[-1] - eye[0]))
+
+
+def _worst(qualities: Sequence[Quality]) -> str:
+    """The least reliable of the views, with everything that is said against any of them."""
+    order: tuple[Reliability, ...] = ("no", "doubtful", "yes")
+    reasons = sorted({reason for quality in qualities for reason in quality.reasons})
+    return " ".join([min((quality.reliable for quality in qualities), key=order.index), *reasons])
+
+
 def _ring(count: int, radius_m: float) -> list[NDArray[np.float64]]:
     """rig_from_cam of cameras around the vertical that look outwards."""
     mounts = []
@@ -200,11 +229,11 @@ def _pair(baseline_m: float) -> list[NDArray[np.float64]]:
     return [np.eye(4), right]
 
 
-def _turned(number: int, view: RigView) -> RigView:
+def _turned(number: int, view: RigView, draw: int) -> RigView:
     """The view with an error in its rotation, but the first."""
     if number == 0:
         return view
-    axis = np.random.default_rng(number).normal(size=3)
+    axis = np.random.default_rng((draw, number)).normal(size=3)
     axis /= np.linalg.norm(axis)
     return replace(view, rig_from_cam=view.rig_from_cam @ exp(np.array([0, 0, 0, *(math.radians(_WRONG_DEG) * axis)])))
 
