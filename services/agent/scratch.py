@@ -71,7 +71,11 @@ class ShardScratch:
 
     def input_path(self, key: str, suffix: str) -> Path:
         """Where the input of a video is fetched to. Other inputs are removed."""
-        return self._emptied("input") / f"{key}{suffix}"
+        return self.input_folder() / f"{key}{suffix}"
+
+    def input_folder(self) -> Path:
+        """An empty folder for what one video is made from."""
+        return self._emptied("input")
 
     def staging(self) -> Path:
         """An empty folder for the artifacts of one video."""

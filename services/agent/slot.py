@@ -12,6 +12,7 @@ import resource
 import threading
 import time
 import traceback
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -36,10 +37,11 @@ from services.agent.messages import (
 from services.agent.scratch import ShardScratch, sweep
 from services.agent.traffic import TrafficRecorder
 from services.domain.errors import InputUnavailable, ObjectMissing, ServiceError, StorageError
-from services.domain.models import JobSpec, VideoRef, VideoResult
+from services.domain.models import JobSpec, VideoRef, VideoResult, is_rig
 from services.domain.redaction import redact
 from services.domain.states import VideoStatus
 from services.inputs.fetching import Fetched, fetched
+from services.inputs.rigs import fetched_rig
 from services.inputs.rules import InputRules
 from services.storage import open_store
 from vipe_core.errors import EngineError, OutOfDeviceMemory, VipeError
@@ -143,14 +145,19 @@ class Slot:
         self._progress = SlotProgress(video.key, "fetch")
         scratch = ShardScratch(self._config.scratch_dir, lease)
         engine = self._engine(lease.spec)
-        with fetched(
-            video,
-            self._config.inputs,
-            lambda suffix: scratch.input_path(video.key, suffix),
-            s3_endpoint_url=self._config.s3_endpoint_url,
-            observer=self._traffic,
-        ) as local:
+        with self._fetched(video, scratch) as local:
             return self._annotate_local(task, engine, scratch, local, started)
+
+    def _fetched(self, video: VideoRef, scratch: ShardScratch) -> AbstractContextManager[Fetched]:
+        rules, endpoint_url, observer = self._config.inputs, self._config.s3_endpoint_url, self._traffic
+        if is_rig(video.uri):
+            folder = scratch.input_folder()
+            return fetched_rig(video, rules, folder, s3_endpoint_url=endpoint_url, observer=observer)
+
+        def place(suffix: str) -> Path:
+            return scratch.input_path(video.key, suffix)
+
+        return fetched(video, rules, place, s3_endpoint_url=endpoint_url, observer=observer)
 
     def _annotate_local(
         self, task: AnnotateVideo, engine: Engine, scratch: ShardScratch, local: Fetched, started: float

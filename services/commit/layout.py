@@ -47,9 +47,14 @@ class Member:
 
 # Members in the order in which they lie in the tar: by extension, as the webdataset writer sorts them. The camera
 # file is `S_camera.txt` on disk and `S.camera.txt` in a tar, because webdataset takes the key up to the first dot. The
-# sample's json (quality, provenance, timestamps) travels with the poses, the one tar that everybody downloads.
+# sample's json (quality, provenance, timestamps) travels with the poses, the one tar that everybody downloads, and so
+# does the rig of a view.
 MEMBERS: dict[Attribute, tuple[Member, ...]] = {
-    "pose": (Member("json", "vipe/{key}_info.json", optional=True), Member("npz", "pose/{key}.npz")),
+    "pose": (
+        Member("json", "vipe/{key}_info.json", optional=True),
+        Member("npz", "pose/{key}.npz"),
+        Member("rig.json", "vipe/{key}_rig.json", optional=True),
+    ),
     "intrinsics": (Member("camera.txt", "intrinsics/{key}_camera.txt"), Member("npz", "intrinsics/{key}.npz")),
     "depth": (Member("zip", "depth/{key}.zip"),),
     "rgb": (Member("mp4", "rgb/{key}.mp4"),),

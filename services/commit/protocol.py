@@ -110,7 +110,7 @@ def prepare_payload(
         OSError: Scratch is full or an artifact cannot be read.
     """
     videos = _settled(lease, results)
-    keys = sorted(v.key for v in videos if v.status is VideoStatus.SUCCEEDED)
+    keys = sorted(sample.key for video in videos for sample in video.samples)
     objects: list[PayloadObject] = []
     build_s = upload_s = 0.0
     if keys:
@@ -259,7 +259,10 @@ def _settled(lease: Lease, results: Sequence[VideoResult]) -> tuple[VideoResult,
     planned = [v.key for v in lease.videos]
     if len(by_key) != len(results) or set(by_key) != set(planned) or len(set(planned)) != len(planned):
         raise IntegrityError(f"shard {lease.shard_id} needs exactly one result for each of its {len(planned)} videos")
-    if bad_keys := [key for key in planned if not _KEY.fullmatch(key)]:
+    sample_keys = [sample.key for result in results for sample in result.samples]
+    if len(set(sample_keys)) != len(sample_keys):
+        raise IntegrityError(f"shard {lease.shard_id} has samples of the same key")
+    if bad_keys := [key for key in (*planned, *sample_keys) if not _KEY.fullmatch(key)]:
         raise IntegrityError(f"shard {lease.shard_id} has keys that webdataset would split: {', '.join(bad_keys)}")
     if open_keys := [r.key for r in results if r.status is VideoStatus.PENDING]:
         raise IntegrityError(f"shard {lease.shard_id} has videos without an outcome: {', '.join(open_keys)}")

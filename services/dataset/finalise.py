@@ -184,9 +184,9 @@ def finalise(
                 records.update(digest.encode())
                 completeness.add(record)
                 for video in record.videos:
-                    if video.status is VideoStatus.SUCCEEDED:
-                        meta.write(meta_row(record, video))
-                    else:
+                    for sample in video.samples:
+                        meta.write(meta_row(record, sample))
+                    if not video.samples:
                         failures.write(failure_row(record, video))
                 shards.write(("" if completeness.totals.shards == 1 else ",\n") + json.dumps(_shard(record, digest)))
         totals = completeness.close(num_shards, num_videos)

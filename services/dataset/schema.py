@@ -55,6 +55,8 @@ def meta_schema(spec: JobSpec) -> pa.Schema:
         ("tar_name", pa.string()),
         ("uri", pa.string()),
         ("shard_id", pa.string()),
+        ("rig", pa.string()),
+        ("view", pa.string()),
         ("width", pa.int32()),
         ("height", pa.int32()),
         ("fps", pa.float64()),
@@ -88,7 +90,7 @@ def meta_schema(spec: JobSpec) -> pa.Schema:
 
 
 def meta_row(record: CommitRecord, video: VideoResult) -> dict[str, Any]:
-    """The index row of a video that succeeded.
+    """The index row of a sample: a video that succeeded, or a view of a rig that did.
 
     Raises:
         IntegrityError: The record does not say where its members lie, or how many frames it has.
@@ -107,6 +109,8 @@ def meta_row(record: CommitRecord, video: VideoResult) -> dict[str, Any]:
         "tar_name": record.tar_name,
         "uri": public_uri(video.uri),
         "shard_id": record.shard_id,
+        "rig": video.rig,
+        "view": video.view,
         "width": video.width,
         "height": video.height,
         "fps": video.fps,

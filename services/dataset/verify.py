@@ -28,7 +28,7 @@ from services.dataset.index import DatasetIndex, parquet_errors
 from services.dataset.schema import DATASET_KEY, FAILURES_KEY, META_KEY
 from services.domain.errors import IntegrityError, ObjectMissing
 from services.domain.models import CommitRecord, PayloadObject, PlannedShard, ShardDigest, shard_id
-from services.domain.states import ShardState, VideoStatus
+from services.domain.states import ShardState
 from services.storage.base import ObjectStore
 from services.storage.object_file import open_object
 from services.storage.open import open_store
@@ -226,9 +226,9 @@ class _Index:
 
     def add(self, record: CommitRecord, digest: str) -> None:
         for video in record.videos:
-            if video.status is VideoStatus.SUCCEEDED:
-                self._meta.expect((video.key, video.num_frames, record.tar_name))
-            else:
+            for sample in video.samples:
+                self._meta.expect((sample.key, sample.num_frames, record.tar_name))
+            if not video.samples:
                 self._lost.append((record.shard_id, (video.key, str(video.status), video.error_code)))
         objects = ((o.key, o.size_bytes, o.sha256) for o in record.objects)
         self._records.update(digest.encode())
@@ -354,7 +354,7 @@ def _failures(store: ObjectStore) -> Iterator[tuple[Any, ...]]:
 
 def _read_back(store: ObjectStore, record: CommitRecord, o: PayloadObject, report: Report) -> int:
     """Fetch one tar and compare it with its record; returns its size."""
-    keys = sorted(v.key for v in record.videos if v.status is VideoStatus.SUCCEEDED)
+    keys = sorted(sample.key for video in record.videos for sample in video.samples)
     with tempfile.TemporaryDirectory(prefix="verify-") as name:
         path = Path(name) / f"{o.attribute}.tar"
         store.download(o.key, path)

@@ -8,6 +8,7 @@ import re
 from dataclasses import asdict, dataclass, field
 from datetime import datetime
 from typing import Any, Literal
+from urllib.parse import urlsplit
 
 from services.domain.control import JobControl
 from services.domain.states import JobState, ShardState, VideoStatus
@@ -89,7 +90,7 @@ class VideoRef:
 
     Attributes:
         key: Stable sample key `[a-z0-9_-]+`, the webdataset key and the artifact name; see `video_key`.
-        uri: Absolute path or `s3://` address.
+        uri: Absolute path or address; of a rig file (`is_rig`), which names the videos of its views.
         size_bytes: As listed.
         etag: Content tag of the listing where the store has one.
     """
@@ -108,6 +109,19 @@ def video_key(uri: str, hex_digits: int = 8) -> str:
     stem = uri.rstrip("/").rsplit("/", 1)[-1].rsplit(".", 1)[0]
     readable = re.sub(r"[^a-z0-9_-]+", "-", stem.lower()).strip("-")[:48] or "video"
     return f"{readable}-{hashlib.sha256(uri.encode()).hexdigest()[:hex_digits]}"
+
+
+def is_rig(uri: str) -> bool:
+    """Whether an input is a rig file: the views that it names are annotated together, as one video of the job."""
+    path = urlsplit(uri).path if "://" in uri else uri
+    member, hash_sign, number = path.rpartition("#")
+    name = (member if hash_sign and number.isdigit() else path).rsplit("/", 1)[-1].lower()
+    return name == "rig.json" or name.endswith(".rig.json")
+
+
+def view_key(rig: str, view: str) -> str:
+    """Sample key of a view of a rig. The capitals keep it apart from every key of a video."""
+    return f"{rig}_VIEW_{view}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -291,6 +305,10 @@ class VideoResult:
         peak_bytes: Most memory of the GPU per stage; None without one.
         source: What the probe found (codec, pixel format, rotation, size).
         deaths: The worker processes that died on it, where it is quarantined for them.
+        views: Of a rig that succeeded, the rows of its views; its own row counts their frames, and describes the first
+            and says what is said of the worst.
+        rig: Of a view, the key of its rig.
+        view: Of a view, its name in the rig.
     """
 
     key: str
@@ -318,19 +336,30 @@ class VideoResult:
     provenance: dict[str, Any] | None = None
     deaths: tuple[Death, ...] | None = None
     peak_bytes: dict[str, int] | None = None
+    views: tuple[VideoResult, ...] | None = None
+    rig: str | None = None
+    view: str | None = None
+
+    @property
+    def samples(self) -> tuple[VideoResult, ...]:
+        """The rows of its samples in the data set: of the views of a rig, else its own; none where it failed."""
+        if self.status is not VideoStatus.SUCCEEDED:
+            return ()
+        return (self,) if self.views is None else self.views
 
     def to_json(self) -> dict[str, Any]:
         return asdict(self)
 
     @classmethod
     def from_json(cls, data: dict[str, Any]) -> VideoResult:
-        params, deaths = data.get("camera_params"), data.get("deaths")
+        params, deaths, views = data.get("camera_params"), data.get("deaths"), data.get("views")
         return cls(
             **{
                 **data,
                 "status": VideoStatus(data["status"]),
                 "camera_params": None if params is None else tuple(params),
                 "deaths": None if deaths is None else tuple(Death(**death) for death in deaths),
+                "views": None if views is None else tuple(cls.from_json(view) for view in views),
             }
         )
 

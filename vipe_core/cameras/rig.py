@@ -176,24 +176,28 @@ class Rig:
         }
 
 
-def read_rig(path: str | Path) -> Rig:
+def read_rig(path: str | Path, name: str | None = None) -> Rig:
     """The rig of a file.
+
+    Args:
+        name: For messages; that of the file if None.
 
     Raises:
         ConfigError: There is no such file, or it does not hold a rig.
     """
     path = Path(path)
+    name = name or path.name
     try:
         if path.stat().st_size > _MAX_BYTES:
-            raise ConfigError(f"{path.name}: a rig file of more than {_MAX_BYTES} bytes is none")
+            raise ConfigError(f"{name}: a rig file of more than {_MAX_BYTES} bytes is none")
         data = json.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
-        raise ConfigError(f"{path.name}: the rig file cannot be read: {error.strerror}") from error
+        raise ConfigError(f"{name}: the rig file cannot be read: {error.strerror}") from error
     except ValueError as error:
-        raise ConfigError(f"{path.name}: the rig file is not JSON") from error
+        raise ConfigError(f"{name}: the rig file is not JSON") from error
     if not isinstance(data, dict):
-        raise ConfigError(f"{path.name}: the rig file must hold a JSON object")
-    return Rig.from_json(data, path.name)
+        raise ConfigError(f"{name}: the rig file must hold a JSON object")
+    return Rig.from_json(data, name)
 
 
 def _view(data: Any, name: str) -> RigView:
