@@ -26,18 +26,21 @@ import os
 import resource
 import signal
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 
-from services.agent.engine import ProgressCallback, index_row
+from services.agent.engine import ProgressCallback, VipeEngine, index_row
 from services.agent.messages import Grant
-from services.domain.models import JobSpec, VideoRef, VideoResult
-from vipe_core.annotation import MEASURED, Annotation, DenseFrame, Provenance, Quality
+from services.domain.models import JobSpec, VideoRef, VideoResult, is_rig
+from vipe_core.annotation import MEASURED, Annotation, DenseFrame, Progress, Provenance, Quality
 from vipe_core.cameras import Camera
+from vipe_core.cameras.rig import Rig
 from vipe_core.errors import ConfigError, CorruptMedia, DecodeCrashed, OutOfDeviceMemory
 from vipe_core.formats import write_artifacts
+from vipe_core.pipeline.rig_annotator import RigAnnotation, RigAnnotator
 
 WIDTH, HEIGHT = 16, 12
 _LEAKED: list[bytes] = []
@@ -64,6 +67,8 @@ class ScriptedEngine:
         progress: ProgressCallback,
         grant: Grant | None = None,
     ) -> VideoResult:
+        if is_rig(video.uri):
+            return VipeEngine(cast(RigAnnotator, ScriptedRigs())).annotate(path, video, spec, root, progress)
         script = dict(part.partition("=")[::2] for part in path.read_text().split())
         frames = int(script.get("frames", "4"))
         progress("track", 0, frames, 0.0)
@@ -117,6 +122,28 @@ def _take_gpu_memory(path: Path, grant: Grant | None, full_bytes: int, low_bytes
     assert grant is not None
     if (low_bytes if grant.low_memory else full_bytes) > grant.memory_bytes:
         raise OutOfDeviceMemory(f"{path}: the GPU's memory ran out")
+
+
+class ScriptedRigs:
+    """An annotator of rigs whose views are such scripts, `frames` and `error`."""
+
+    def annotate_rig(
+        self,
+        rig: Rig,
+        videos: None,
+        *,
+        names: Sequence[str],
+        scale_from: str | None,
+        progress: Callable[[Progress], None],
+    ) -> RigAnnotation:
+        views = []
+        for view, name in zip(rig.views, names, strict=True):
+            script = Path(view.video or "").read_text()
+            if script == "error":
+                raise CorruptMedia(f"{view.video}: not a video")
+            views.append(fake_annotation(name, int(script.removeprefix("frames="))))
+        progress(Progress("track", views[0].num_frames, views[0].num_frames))
+        return RigAnnotation(tuple(views), rig, views[0].world_from_cam)
 
 
 def _first_time(marker: str | None) -> bool:
