@@ -120,7 +120,7 @@ class VipeEngine:
     ) -> VideoResult:
         """The views of a rig as samples of their own, each with the rig that was found."""
         from vipe_core.cameras.rig import read_rig
-        from vipe_core.formats.layout import info_path
+        from vipe_core.formats.layout import rig_path
 
         known = read_rig(path, video.uri)
         shares = _Shares(progress, len(known.views))
@@ -132,7 +132,7 @@ class VipeEngine:
         rows = []
         for view, key, annotation in zip(known.views, keys, found.views, strict=True):
             shares.write(annotation, root, attributes)
-            info_path(root, key).with_name(f"{key}_rig.json").write_text(document, encoding="utf-8")
+            rig_path(root, key).write_text(document, encoding="utf-8")
             row = index_row(annotation, replace(video, key=key))
             rows.append(replace(row, rig=video.key, view=view.name))
         return rig_row(rows, video)

@@ -41,7 +41,7 @@ from services.domain.models import Lease
 from services.domain.states import VideoStatus
 from services.storage import DirectoryStore
 from vipe_core.formats import member_path
-from vipe_core.formats.layout import info_path
+from vipe_core.formats.layout import info_path, rig_path
 
 KEYS = ["b-2", "a_1", "c-3"]  # not sorted, as a plan may be
 
@@ -202,11 +202,8 @@ def test_a_key_that_webdataset_would_split_is_refused(store: DirectoryStore, tmp
 def test_the_artifacts_are_where_the_engine_puts_them(tmp_path: Path) -> None:
     for attribute, members in MEMBERS.items():
         for member in members:
-            expected = (
-                info_path(tmp_path, "k")
-                if member.extension == "json"
-                else tmp_path / member_path(attribute, member.name("k"))
-            )
+            ours = {"json": info_path, "rig.json": rig_path}.get(member.extension)
+            expected = tmp_path / member_path(attribute, member.name("k")) if ours is None else ours(tmp_path, "k")
             assert member.path(tmp_path, "k") == expected
 
 

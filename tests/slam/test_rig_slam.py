@@ -8,14 +8,20 @@ import numpy as np
 import pytest
 import torch
 from exact_rig import CAMERA, ExactRig, ExactRigSource, fan_of_cameras
-from exact_scene import trajectory
+from exact_scene import GRID, trajectory
 from numpy.typing import NDArray
 
 from vipe_core.cameras.rig import angle_between_deg
 from vipe_core.errors import ConfigError
 from vipe_core.geometry import umeyama
 from vipe_core.geometry.arrays import exp, inverse
+from vipe_core.priors.protocols import Match
+from vipe_core.slam.crossviews import CrossViews
+from vipe_core.slam.graph import Graph
+from vipe_core.slam.keyframes import KeyframeMap
+from vipe_core.slam.measuring import MeasuredGraph
 from vipe_core.slam.rig_system import RigCameras, RigSlam, RigSlamResult
+from vipe_core.slam.selection import Keyframe
 from vipe_core.slam.settings import SlamSettings
 
 PATH = trajectory(14, [-0.08, 0.01, -0.01, 0.0, 0.008, 0.002])
@@ -36,6 +42,18 @@ def path_error(rig: ExactRig, found: RigSlamResult) -> tuple[float, float]:
     length = float(np.linalg.norm(np.diff(truth[:, 0, :3, 3], axis=0), axis=1).sum())
     error = float(np.sqrt(np.square(fit.apply(actual) - expected).sum(axis=1).mean()))
     return error / length, fit.scale
+
+
+class AskedRig(ExactRig):
+    """Remembers which pictures were matched."""
+
+    def __init__(self, rig_from_world: NDArray[np.float64], cam_from_rig: NDArray[np.float64]) -> None:
+        super().__init__(rig_from_world, cam_from_rig)
+        self.asked: list[tuple[int, int]] = []
+
+    def match(self, source: int, target: int, guess_px: object = None) -> tuple[Match, Match]:
+        self.asked.append((source, target))
+        return super().match(source, target, guess_px)
 
 
 def turned(mounts: NDArray[np.float64], angle_deg: float) -> NDArray[np.float64]:
@@ -70,6 +88,24 @@ def test_cameras_in_one_place_turn_as_one_and_tell_no_scale() -> None:
     found = run(rig, RigCameras(rig.cam_from_rig, (CAMERA, CAMERA)))
     assert path_error(rig, found)[0] < 1e-3
     assert math.isinf(found.scale_sigma_ratio)
+
+
+@pytest.mark.parametrize(("distance", "at_one_instant"), [(1.0, False), (10.0, True)])
+def test_views_are_linked_by_what_their_depths_say_that_they_see_of_one_another(
+    distance: float, at_one_instant: bool
+) -> None:
+    """Two views side by side on a sideways path: what the right one sees, the left one sees six instants later. Were
+    everything far away, they would see the same at once."""
+    rig = AskedRig(trajectory(8, [-0.5, 0, 0, 0, 0, 0]), fan_of_cameras(2, 3.0, 0.0))
+    keyframes, graph = KeyframeMap(GRID, "pinhole", CAMERA.index_params(), rig.cam_from_rig), Graph()
+    for k, (pose, depth) in enumerate(zip(rig.cam_from_world, rig.inverse_depth, strict=True)):
+        keyframes.append(Keyframe(k // 2, k), k // 2 / 30, pose, depth / distance)
+    measured = MeasuredGraph(keyframes, graph, rig, None, None, rig.reprojector)
+    CrossViews(measured, rig.reprojector).connect([0, 1])
+    assert ((0, 1) in rig.asked) is at_one_instant
+    # View 1 of instant 0 stands where view 0 stands at instant 6.
+    assert (frozenset((1, 12)) in map(frozenset, graph)) is not at_one_instant
+    assert all(i % 2 != j % 2 for i, j in rig.asked)
 
 
 def test_views_and_videos_must_be_as_many() -> None:

@@ -42,6 +42,11 @@ def info_path(root: str | Path, name: str) -> Path:
     return Path(root, INFO_FOLDER, f"{name}_info.json")
 
 
+def rig_path(root: str | Path, name: str) -> Path:
+    """The rig that was found (`cameras.rig`), of a view in a data set."""
+    return Path(root, INFO_FOLDER, f"{name}_rig.json")
+
+
 def artifact_path(root: str | Path, name: str, attribute: str, suffix: str) -> Path:
     return Path(root, _MEMBERS[attribute][suffix].format(name))
 
