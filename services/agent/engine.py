@@ -91,7 +91,7 @@ class VipeEngine:
         if is_rig(video.uri):
             if spec.calibration is not None:
                 raise ConfigError("a rig file holds the cameras of its views; submit rigs in a job without calibration")
-            return self._annotate_rig(path, video, spec, root, attributes, progress)
+            return self._annotate_rig(path, video, spec, root, attributes, progress, grant)
         shares = _Shares(progress)
         known = None if spec.calibration is None else Calibration.from_json(spec.calibration)
         try:
@@ -117,6 +117,7 @@ class VipeEngine:
         root: Path,
         attributes: Sequence[Attribute],
         progress: ProgressCallback,
+        grant: Grant | None,
     ) -> VideoResult:
         """The views of a rig as samples of their own, each with the rig that was found."""
         from vipe_core.cameras.rig import read_rig
@@ -125,16 +126,23 @@ class VipeEngine:
         known = read_rig(path, video.uri)
         shares = _Shares(progress, len(known.views))
         keys = [view_key(video.key, view.name) for view in known.views]
-        found = self._annotator.annotate_rig(
-            known, None, names=keys, scale_from=spec.scale_from, progress=shares.during
-        )
-        document = json.dumps(found.rig.to_json(), indent=1) + "\n"
         rows = []
-        for view, key, annotation in zip(known.views, keys, found.views, strict=True):
-            shares.write(annotation, root, attributes)
-            rig_path(root, key).write_text(document, encoding="utf-8")
-            row = index_row(annotation, replace(video, key=key))
-            rows.append(replace(row, rig=video.key, view=view.name))
+        try:
+            found = self._annotator.annotate_rig(
+                known,
+                names=keys,
+                scale_from=spec.scale_from,
+                memory_bytes=None if grant is None else grant.memory_bytes,
+                progress=shares.during,
+            )
+            document = json.dumps(found.rig.to_json(), indent=1) + "\n"
+            for view, key, annotation in zip(known.views, keys, found.views, strict=True):
+                shares.write(annotation, root, attributes)
+                rig_path(root, key).write_text(document, encoding="utf-8")
+                row = index_row(annotation, replace(video, key=key))
+                rows.append(replace(row, rig=video.key, view=view.name))
+        finally:
+            self._annotator.release()
         return rig_row(rows, video)
 
 

@@ -130,10 +130,10 @@ class ScriptedRigs:
     def annotate_rig(
         self,
         rig: Rig,
-        videos: None,
         *,
         names: Sequence[str],
         scale_from: str | None,
+        memory_bytes: int | None,
         progress: Callable[[Progress], None],
     ) -> RigAnnotation:
         views = []
@@ -144,6 +144,9 @@ class ScriptedRigs:
             views.append(fake_annotation(name, int(script.removeprefix("frames="))))
         progress(Progress("track", views[0].num_frames, views[0].num_frames))
         return RigAnnotation(tuple(views), rig, views[0].world_from_cam)
+
+    def release(self) -> None:
+        pass
 
 
 def _first_time(marker: str | None) -> bool:

@@ -66,6 +66,7 @@ class RigAnnotator(Annotator):
         *,
         names: Sequence[str] | None = None,
         scale_from: str | None = None,
+        memory_bytes: int | None = None,
         progress: ProgressCallback | None = None,
     ) -> RigAnnotation:
         """Poses, cameras and quality of every view; dense depth when it is asked for.
@@ -75,6 +76,7 @@ class RigAnnotator(Annotator):
             videos: One per view, in their order; those that the rig file names, which lie beside it, if None.
             names: Of the sequences that come out; those of the views if None.
             scale_from: As in `Annotator.annotate`, for the first view; it takes the place of the size of the rig.
+            memory_bytes: As there.
             progress: Told how far the annotation is; an exception out of it ends the annotation.
 
         Raises:
@@ -102,6 +104,7 @@ class RigAnnotator(Annotator):
         solved = [undistorted(one, camera) for one, camera in zip(opened, given, strict=True)]
         source = SynchronisedSource(solved, titles)
         report = Reporter(progress)
+        self._budget(memory_bytes, low_memory=False)
         with typed_errors(opened[0], report), torch.inference_mode():
             slam = RigSlam(priors, self.preset.slam, self.device)
             cameras = [camera_to_solve(camera, one) for camera, one in zip(given, solved, strict=True)]
