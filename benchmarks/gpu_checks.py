@@ -12,7 +12,7 @@
 
 Every section runs in a process of its own under a time limit and survives the failure of another; those that measure no
 time run side by side. What they print is in `--output FOLDER`, its end on the terminal, a summary last. Without a GPU
-it says so and does nothing. `--vipe FOLDER` and `--droid FOLDER` are handed to `benchmarks.ba`.
+it says so and does nothing. `--vipe FOLDER` and `--droid FOLDER` are handed to the benchmarks.
 """
 
 from __future__ import annotations
@@ -344,14 +344,16 @@ def _sections(vipe: Path | None, droid: Path | None) -> list[list[Section]]:
     for tool in ("memcheck", "racecheck", "initcheck") if sanitizer else ():
         watched = [str(sanitizer), "--tool", tool, "--error-exitcode", "9", *this, "small-solves"]
         beside.append(Section(tool, watched, 150))
-    peers = [*(["--vipe", str(vipe)] if vipe else []), *(["--droid", str(droid)] if droid else [])]
+    theirs = ["--vipe", str(vipe)] if vipe else []
+    peers = [*theirs, *(["--droid", str(droid)] if droid else [])]
+    pipeline = [sys.executable, "-u", "-m", "benchmarks.gpu_pipeline", "--frames", "90", *theirs]
     sizes = ["25x120", "25x200", "100x1000", "250x3000", "500x6000"]
     return [
         [Section("compile", [*this, "compile"], 80)],
         beside,
         [Section("one wait", [*this, "one-wait"], 40)],
         [Section("ba", [sys.executable, "-u", "-m", "benchmarks.ba", *peers, "--sizes", *sizes], 220, 5000)],
-        [Section("pipeline", [sys.executable, "-u", "-m", "benchmarks.gpu_pipeline", "--frames", "90"], 110, 3000)],
+        [Section("pipeline", pipeline, 110, 3000)],
     ]
 
 

@@ -1,11 +1,15 @@
 """Speed of the network's SLAM on a device: frames per second for several videos at once, stage by stage.
 
-    python -m benchmarks.gpu_pipeline [--device cuda] [--videos 1 2 4 8] [--frames N] [--size WxH] [--lean]
+    python -m benchmarks.gpu_pipeline [--device cuda] [--videos 1 2 4 8] [--frames N] [--lean] [--vipe FOLDER]
 
 Weights are random and seeded, so nothing that a network sees may decide anything: every n-th frame is a keyframe, none
 is dropped, and edges join each keyframe with the three before it. The counts are printed. Each video has a process of
 its own, as in the service; the clock runs from when all of them are ready to when the last is done. Without --device
 the first GPU is taken; on a machine without one, a tiny clip on the CPU shows that the command works, and says so.
+
+`--vipe` is an unpacked source distribution of nvidia-vipe 1.2.0: its SLAM then does the same to the same clip with the
+same weights, see `peers/vipe_slam.py`. On a GPU its extension must have been built there (`python setup.py build_ext
+--inplace`, with nvcc and Eigen).
 """
 
 from __future__ import annotations
@@ -16,12 +20,15 @@ import multiprocessing
 import sys
 import tempfile
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
+from functools import partial
+from itertools import islice
 from multiprocessing.synchronize import Barrier
 from pathlib import Path
 from queue import Queue
+from threading import BrokenBarrierError
 
 import numpy as np
 import torch
@@ -62,12 +69,14 @@ class Workload:
         every: Every so many-th frame is a keyframe.
         device: Where networks and bundle adjustment run.
         settings: Of the SLAM stage, with a schedule that nothing of the picture decides.
+        vipe: Source of nvidia-vipe, which then does the work; None for ours.
     """
 
     video: Path
     every: int
     device: str
     settings: SlamSettings
+    vipe: Path | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,12 +97,13 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--frames", type=int, help="of each video")
     parser.add_argument("--size", help="of the video, WIDTHxHEIGHT")
     parser.add_argument("--every", type=int, help="every n-th frame is a keyframe")
+    parser.add_argument("--vipe", type=Path, help="unpacked source of nvidia-vipe, to run beside ours")
     parser.add_argument("--lean", action="store_true", help="no volumes of correlation: the profile for small GPUs")
     arguments = parser.parse_args(argv)
     device = resolve_device(arguments.device or ("cuda" if torch.cuda.is_available() else "cpu"))
     on_gpu = device.type == "cuda"
-    width, height = (int(side) for side in (arguments.size or ("640x480" if on_gpu else "64x48")).split("x"))
-    frames = arguments.frames or (300 if on_gpu else 12)
+    width, height = (int(side) for side in (arguments.size or ("640x480" if on_gpu else "128x128")).split("x"))
+    frames = arguments.frames or (300 if on_gpu else 20)
     every = arguments.every or (6 if on_gpu else 2)
     counts = arguments.videos or ([1, 2, 4, 8] if on_gpu else [1, 2])
     settings = _settings(lean=arguments.lean, short=not on_gpu)
@@ -107,14 +117,19 @@ def main(argv: Sequence[str] | None = None) -> int:
         video = _clip(Path(folder) / "clip.mp4", frames, width, height)
         workload = Workload(video, every, str(device), settings)
         table = Table(title=f"{frames} frames of {width}x{height}, random weights, a fixed schedule")
-        for heading in ("videos at once", "frames/s", "wall s", "GB at most", "keyframes", "edges", "seconds by stage"):
-            table.add_column(heading, justify="left" if heading == "seconds by stage" else "right")
-        for count in counts:
-            wall_s, runs = _at_once(workload, count)
+        for heading in ("whose", "videos at once", "frames/s", "wall s", "GB at most", "keyframes", "edges"):
+            table.add_column(heading, justify="right")
+        table.add_column("seconds by stage")
+        both = [("ours", workload)]
+        if arguments.vipe is not None:
+            both.append(("nvidia-vipe", replace(workload, vipe=arguments.vipe)))
+        for count, (whose, work) in ((count, one) for count in counts for one in both):
+            wall_s, runs = _at_once(work, count)
             stages = ", ".join(
                 f"{stage} {np.mean([run.seconds[stage] for run in runs]):.2f}" for stage in runs[0].seconds
             )
             table.add_row(
+                whose,
                 str(count),
                 f"{sum(run.frames for run in runs) / wall_s:.2f}",
                 f"{wall_s:.2f}",
@@ -147,8 +162,10 @@ def _at_once(workload: Workload, count: int) -> tuple[float, list[Run]]:
     try:
         ready.wait(_PATIENCE_S)
         start_s = time.perf_counter()
-        runs: list[Run] = [answers.get(timeout=_PATIENCE_S) for _ in workers]
+        runs = [answers.get(timeout=_PATIENCE_S) for _ in workers]
         wall_s = time.perf_counter() - start_s
+    except BrokenBarrierError as error:
+        raise SystemExit("a worker failed before it was ready; it says why above") from error
     finally:
         for worker in workers:
             worker.join(1.0)
@@ -157,12 +174,48 @@ def _at_once(workload: Workload, count: int) -> tuple[float, list[Run]]:
 
 
 def _worker(workload: Workload, ready: Barrier, answers: Queue[Run]) -> None:
+    try:
+        run = _ready(workload)
+    except BaseException:
+        ready.abort()
+        raise
+    ready.wait(_PATIENCE_S)
+    answers.put(run(None))
+
+
+def _ready(workload: Workload) -> Callable[[int | None], Run]:
+    """What annotates the first so many frames of the clip, warmed up."""
     set_threads(1)
     device = resolve_device(workload.device)
-    network = DroidNetwork.random(_SEED).ready(device)
-    _annotate(workload, network, frames=2 * workload.every + 1)  # kernels are compiled and memory is there
-    ready.wait(_PATIENCE_S)
-    answers.put(_annotate(workload, network))
+    run: Callable[[int | None], Run]
+    if workload.vipe is None:
+        network = DroidNetwork.random(_SEED).ready(device)
+        run = partial(_annotate, workload, network)
+    else:
+        run = _vipe(workload, workload.vipe, device)
+    run(9 * workload.every + 1)  # kernels are compiled and memory is there
+    return run
+
+
+def _vipe(workload: Workload, folder: Path, device: torch.device) -> Callable[[int | None], Run]:
+    """The same work by nvidia-vipe."""
+    from benchmarks.peers import vipe_slam
+
+    settings = workload.settings
+    info = open_source(workload.video).info
+    size = working_size(info.width, info.height, settings.working_area_px)
+    focal_px = Camera.pinhole_from_fov(60.0, size.width, size.height).focal_px
+    _, *steps = settings.refinement.global_updates
+    state = DroidNetwork.random(_SEED).state_dict()
+    slam = vipe_slam.VipeSlam(vipe_slam.load(folder), state, size.size, focal_px, (steps[0], steps[1]), device)
+
+    def run(frames: int | None) -> Run:
+        clock = StageClock(device)
+        done = slam.run(islice(vipe_slam.frames_of(workload.video), frames), workload.every, clock)
+        peak_bytes = max(clock.peak_bytes.values(), default=0)
+        return Run(done.frames, done.keyframes, done.edges, clock.seconds, peak_bytes)
+
+    return run
 
 
 def _annotate(workload: Workload, network: DroidNetwork, frames: int | None = None) -> Run:
@@ -178,6 +231,8 @@ def _annotate(workload: Workload, network: DroidNetwork, frames: int | None = No
     keyframes: list[Keyframe] = []
     with clock("decode and encode"), closing(encoded.first_pass()) as stream:
         for work, features in stream:
+            if keyframes:
+                matcher.motion_px(keyframes[-1].features, features)  # It decides nothing, and takes its time.
             if work.index % workload.every == 0:
                 keyframes.append(Keyframe(work.index, features))
             if frames is not None and work.index + 1 == frames:

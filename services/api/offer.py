@@ -52,8 +52,8 @@ def one_of(value: str, offered: tuple[str, ...]) -> str:
     return value
 
 
-def preset_options(preset: str, options: dict[str, Any]) -> None:
-    """Check what a job changes of a preset, as `JobSpec.preset_options` has it.
+def preset_options(preset: str, camera: str | None, options: dict[str, Any]) -> None:
+    """Check what a job changes of a preset: its camera model, and what `JobSpec.preset_options` has.
 
     Raises:
         ValueError: The engine does not take it.
@@ -62,7 +62,7 @@ def preset_options(preset: str, options: dict[str, Any]) -> None:
     from vipe_core.pipeline.presets import PresetOptions, resolve
 
     try:
-        resolve(preset, options=PresetOptions(**options))
+        resolve(preset, camera, PresetOptions(**options))
     except ConfigError as error:
         raise ValueError(str(error)) from error
 

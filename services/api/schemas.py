@@ -99,7 +99,9 @@ class JobRequest(ControlFields):
             raise ValueError("camera and calibration exclude each other: the calibration says which model it is")
         if "\x00" in self.name:
             raise ValueError("name must not hold NUL characters")
-        offer.preset_options(self.preset, self._options())
+        offer.preset_options(self.preset, self.camera, self._options())
+        if self.calibration is not None and offer.camera_of(self.preset) == "equirect":
+            raise ValueError(f"the preset {self.preset} is for 360-degree video, which needs no calibration")
         return self
 
     def _options(self) -> dict[str, Any]:

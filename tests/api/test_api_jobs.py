@@ -12,6 +12,8 @@ from services.api import paging
 from services.domain.models import JobSpec, LeaseProgress
 from services.store.sql import SqlStore
 
+LENS = {"version": 1, "model": "pinhole", "width": 640, "height": 480, "fx": 500, "fy": 505, "cx": 340, "cy": 240}
+
 
 class TestCreate:
     def test_it_is_accepted_with_its_place(self, http: httpx.Client) -> None:
@@ -42,20 +44,10 @@ class TestCreate:
         assert http.get(answer.headers["location"]).json() == job
 
     def test_a_calibration_goes_along_in_one_form(self, http: httpx.Client) -> None:
-        lens = {
-            "version": 1,
-            "model": "pinhole",
-            "width": 640,
-            "height": 480,
-            "fx": 500,
-            "fy": 505,
-            "cx": 340,
-            "cy": 240,
-        }
-        spec = http.post("/v1/jobs", json=body(calibration={**lens, "pixel_centre": "integer"})).json()["spec"]
-        assert spec["calibration"] == {**lens, "cx": 340.5, "cy": 240.5, "use": "fixed"}
+        spec = http.post("/v1/jobs", json=body(calibration={**LENS, "pixel_centre": "integer"})).json()["spec"]
+        assert spec["calibration"] == {**LENS, "cx": 340.5, "cy": 240.5, "use": "fixed"}
         assert JobSpec.from_json(spec).config_hash != JobSpec.from_json({**spec, "calibration": None}).config_hash
-        for wrong in ({"calibration": {**lens, "fx": -1}}, {"calibration": lens, "camera": "mei"}):
+        for wrong in ({"calibration": {**LENS, "fx": -1}}, {"calibration": LENS, "camera": "mei"}):
             assert http.post("/v1/jobs", json=body(**wrong)).status_code == 422
 
     def test_attributes_of_a_request_and_of_the_domain_agree(self, http: httpx.Client) -> None:
@@ -122,6 +114,9 @@ class TestCreate:
             ({"metric_depth": "magic"}, "body.metric_depth"),
             ({"detection_interval_s": 0}, "body.detection_interval_s"),
             ({"phrases": ["x" * 65]}, "body.phrases.0"),
+            ({"preset": "vipe_fast", "camera": "equirect"}, "body"),
+            ({"preset": "panorama", "metric_depth": "hf.depth_pro"}, "body"),
+            ({"preset": "panorama", "calibration": LENS}, "body"),
             ({"unknown": 1}, "body.unknown"),
         ],
     )

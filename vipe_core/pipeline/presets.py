@@ -182,6 +182,7 @@ _PRESETS = {
         ),
     )
 }
+_PANORAMIC_DEPTH = ("nvidia_vipe.unik3d",)
 _INTRINSICS = {
     "pinhole": "classical.two_view_focal",
     "mei": "classical.unified_sweep",
@@ -216,4 +217,17 @@ def resolve(preset: str | Preset, camera: str | None = None, options: PresetOpti
     learned = found.intrinsics in GEOCALIB.values() and camera in GEOCALIB
     intrinsics = GEOCALIB[camera] if learned else _INTRINSICS[camera]
     found = dataclasses.replace(found, camera=camera, intrinsics=intrinsics)
-    return found if options is None else options.applied(found)
+    if options is not None:
+        found = options.applied(found)
+    if camera == "equirect":
+        _require_panoramic(found)
+    return found
+
+
+def _require_panoramic(preset: Preset) -> None:
+    if preset.matcher != _CLASSICAL.matcher:
+        raise ConfigError(f"the preset {preset.name} does not annotate panoramas; panorama and classical do")
+    if preset.metric not in (NONE, *_PANORAMIC_DEPTH):
+        raise ConfigError(
+            f"{preset.metric} does not know panoramas; metric depth that does: {', '.join(_PANORAMIC_DEPTH)}"
+        )

@@ -65,7 +65,7 @@ class GlobalGru(nn.Module):
 class FrameAggregation(nn.Module):
     """The mean over the edges out of each frame, and the damping of the frame's inverse depth that it says.
 
-    `upmask` belongs to the checkpoint; the inverse depth of the grid is not upsampled by it.
+    `upmask` belongs to the checkpoint and enlarges depths of keyframes; dense depth here is measured in every frame.
     """
 
     def __init__(self, hidden: int) -> None:
