@@ -7,7 +7,7 @@ export OMP_WAIT_POLICY ?= passive
 # Ray and matplotlib must not phone home or open windows.
 export RAY_USAGE_STATS_ENABLED := 0
 
-.PHONY: demo test setup lint types unit chaos lock format audit fuzz clean
+.PHONY: demo test setup lint types unit chaos kernels lock format audit fuzz clean
 
 $(VENV)/.runtime: pyproject.toml requirements.lock scripts/setup.sh
 	@scripts/setup.sh
@@ -39,6 +39,9 @@ SEED ?= 1
 MINUTES ?= 5
 chaos: setup ## a job of 64 videos while everything around it breaks; SEED=2 MINUTES=3 for another run
 	$(VENV)/bin/python -m benchmarks.chaos --seed $(SEED) --minutes $(MINUTES)
+
+kernels: setup ## compile every CUDA kernel of bundle adjustment for three generations of GPUs; needs none
+	$(VENV)/bin/python -m benchmarks.ba_kernels
 
 format: setup
 	$(VENV)/bin/ruff check --fix .

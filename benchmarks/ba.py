@@ -292,7 +292,7 @@ def _droid(folder: Path, device: torch.device) -> Droid | None:
     """Its solver, or none where its extension cannot be built; the others are measured all the same."""
     try:
         return Droid.load(folder, device)
-    except RuntimeError as error:
+    except (RuntimeError, OSError, ImportError) as error:
         print(f"DROID's extension cannot be built: {str(error).strip().splitlines()[-1]}")
         return None
 

@@ -6,6 +6,7 @@
     graph       a captured solve, replayed on other numbers, is bitwise the one launched kernel by kernel
     one wait    a solve makes the host wait for the GPU nowhere but where its answer is read; what a launch costs
     memcheck, racecheck, initcheck   compute-sanitizer on small solves, where it is installed
+    DROID built the extension of DROID's solver is compiled, where its source is given
     network     the DROID network against itself on the CPU; its kernels and graphs against their absence
     ba          `python -m benchmarks.ba`
     pipeline    `python -m benchmarks.gpu_pipeline`, with short clips
@@ -118,8 +119,8 @@ def _scene(frames: int, cells: tuple[int, int], unified: bool, focal: bool, reac
 def _rig_scene(focal: bool) -> tuple[Problem, State]:
     """Three cameras on a rig that moves, its extrinsics free under a prior; each with intrinsics of its own, or the
     focal length of all free."""
-    problem, start = _scene(12, (6, 11), False, focal, 4)
-    rig = Rig(torch.arange(12) // 3, torch.arange(12) % 3)
+    problem, start = _scene(9, (4, 7), False, focal, 4)
+    rig = Rig(torch.arange(9) // 3, torch.arange(9) % 3)
     rng = torch.Generator().manual_seed(1)
     cam_from_rig = se3.exp(0.02 * torch.randn(3, 6, generator=rng, dtype=torch.float64))
     rig_from_world = start.cam_from_world[3 * rig.pose_of_frame]
@@ -136,7 +137,7 @@ def _rig_scene(focal: bool) -> tuple[Problem, State]:
         priors=replace(problem.priors, cam_from_rig=cam_from_rig, extrinsic_sigma=torch.full((3, 2), 0.1)),
         rig=rig,
     )
-    away = se3.exp(0.005 * torch.randn(4, 6, generator=rng, dtype=torch.float64))[rig.pose_of_frame]
+    away = se3.exp(0.005 * torch.randn(3, 6, generator=rng, dtype=torch.float64))[rig.pose_of_frame]
     moved = torch.where(free.poses[:, None, None], away @ rig_from_world, rig_from_world)
     return problem, replace(truth, cam_from_world=cam_from_rig[rig.view_of_frame] @ moved)
 
@@ -289,7 +290,9 @@ def check_one_wait() -> str:
 
 def check_small_solves() -> str:
     """What compute-sanitizer watches: one solve of every kind of kernel, on shapes that fill nothing evenly."""
-    for problem, start, robust in _shapes()[:4] + _shapes()[-2:]:
+    shapes = _shapes()
+    # Both cameras with and without free intrinsics, a frame with more edges than fit shared memory, rigs.
+    for problem, start, robust in [*shapes[:4], shapes[17], *shapes[-2:]]:
         _kernels(*_moved(problem, start, _device()), Options(max_iterations=2, robust=robust, robust_scale_px=4.0))
     return "done"
 
@@ -340,6 +343,10 @@ def _sections(vipe: Path | None, droid: Path | None) -> list[list[Section]]:
         Section("graph", [*this, "graph"], 60),
         Section("network", [*tests, "tests/priors/test_droid_gpu.py"], 150),
     ]
+    if droid is not None:
+        build = f"import torch, pathlib; Droid.load(pathlib.Path({str(droid)!r}), torch.device('cuda'))"
+        command = [sys.executable, "-c", f"from benchmarks.peers.droid_ba import Droid; {build}"]
+        beside.append(Section("DROID built", command, 150))
     sanitizer = next(filter(None, map(shutil.which, _SANITIZER)), None)
     for tool in ("memcheck", "racecheck", "initcheck") if sanitizer else ():
         watched = [str(sanitizer), "--tool", tool, "--error-exitcode", "9", *this, "small-solves"]

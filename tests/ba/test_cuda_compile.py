@@ -26,15 +26,12 @@ from vipe_core.ba.cuda.compiler import (
 pytest.importorskip("cuda.core", reason="cuda-core compiles the kernels")
 pytest.importorskip("cuda.bindings.nvrtc", reason="NVRTC compiles the kernels")
 
-
-# Each camera with each set of intrinsics, each robust kernel, and each architecture twice.
+# Both cameras, every number of free intrinsics, every architecture.
 _SAMPLE = (
-    ("sm_80", Specialisation(False, False, False, "tukey")),
-    ("sm_80", Specialisation(True, True, False, "geman_mcclure")),
+    ("sm_80", Specialisation(False, False, False, "huber")),
+    ("sm_80", Specialisation(True, True, False, "tukey")),
     ("sm_90", Specialisation(False, True, False, "geman_mcclure")),
-    ("sm_90", Specialisation(True, True, True, "cauchy")),
-    ("sm_120", Specialisation(True, False, False, "huber")),
-    ("sm_120", Specialisation(True, False, True, "none")),
+    ("sm_120", Specialisation(True, True, True, "cauchy")),
 )
 
 

@@ -222,7 +222,7 @@ def test_any_graph(graph: tuple[Problem, State]) -> None:
 def test_the_bits_depend_neither_on_the_order_of_threads_nor_of_edges_nor_on_where_rows_are_kept(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    problem, truth = problem_of(KINDS[5], num_frames=7, height=11, width=27, reach=3)
+    problem, truth = problem_of(KINDS[5], num_frames=5, height=11, width=27, reach=2)
     problem, start = float32(with_noise(problem, 0.3), disturbed(truth))
     options = Options(max_iterations=3)
     expected = emulated(problem, start, options)

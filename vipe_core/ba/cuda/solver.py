@@ -1,8 +1,9 @@
 """A whole bundle adjustment on the GPU: buffers, the sequence of launches, and the answer.
 
 `Adjustment` prepares a problem once; `run` only launches work on the current stream, always the same, so it can be
-captured in a CUDA graph and replayed after the tensors of problem and state were overwritten in place. What each kernel
-does is in `kernels/*.cu`.
+captured in a CUDA graph and replayed after the tensors of problem and state were overwritten in place. The engine does
+not: its window of edges changes with every keyframe, laying that out takes the host longer than all launches of the
+three or four solves that follow, and these do not wait for the GPU. What each kernel does is in `kernels/*.cu`.
 """
 
 from __future__ import annotations
