@@ -17,8 +17,8 @@ from hypothesis import given, settings
 from rig_scenes import disturbed_rig, rig_scene
 
 from benchmarks import gpu_checks
-from vipe_core.ba import Edges, Free, Options, Priors, Problem, Result, State, Status, cuda, oracle, solve
-from vipe_core.ba.answer import result_of
+from vipe_core.ba import Edges, Free, Options, Priors, Problem, Result, State, Status, cuda, operator, oracle, solve
+from vipe_core.ba.answer import Answer, result_of
 from vipe_core.ba.cuda import layout
 from vipe_core.ba.cuda import solver as cuda_solver
 from vipe_core.ba.cuda.compiler import Specialisation
@@ -155,6 +155,33 @@ def test_a_rig_is_the_hosts(kind: Specialisation, own_intrinsics: bool, extrinsi
     rig_from_world = se3.inverse(found.state.cam_from_rig[problem.rig.view_of_frame]) @ found.state.cam_from_world
     one_each = rig_from_world.reshape(-1, 3, 4, 4)
     torch.testing.assert_close(one_each, one_each[:, :1].expand_as(one_each), rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("focal", [False, True])
+def test_on_a_gpu_the_operator_takes_the_kernels_or_torch(focal: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its kernel for GPUs, with the emulated ones: torch where several views have free intrinsics, and for how sure
+    refined extrinsics are. The answer has the shapes that its fake foretells."""
+    problem, truth = rig_scene(own_intrinsics=True)
+    problem = replace(with_noise(problem, 0.05), free=replace(problem.free, focal=focal, extrinsics=True))
+    problem, start = float32(problem, disturbed_rig(problem, truth, twist=0.005))
+    options = Options(max_iterations=2, robust="none")
+    used: list[cuda_solver.Adjustment] = []
+
+    def on_gpu(problem: Problem, state: State, options: Options) -> Answer:
+        launcher = EmulatedLauncher(cuda_solver.specialisation(problem, options), KINDS)
+        used.append(cuda_solver.Adjustment(problem, state, options, launcher))
+        used[-1].run()
+        return used[-1].answer()
+
+    monkeypatch.setattr(cuda, "solve", on_gpu)
+    arguments = operator._arguments(problem, start, options)
+    answer = operator._on_gpu(*arguments)
+    assert bool(used) is not focal
+    assert [tensor.shape for tensor in answer] == [tensor.shape for tensor in operator._shapes(*arguments)]
+    found, expected = result_of(answer, start), solve(problem, start, options)
+    assert_close(found, expected, rtol=1e-3)
+    assert found.extrinsic_covariances is not None
+    torch.testing.assert_close(found.extrinsic_covariances, expected.extrinsic_covariances, rtol=1e-2, atol=1e-9)
 
 
 def test_what_the_kernels_are_not_for() -> None:

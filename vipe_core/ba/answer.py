@@ -46,6 +46,8 @@ def answer_of(result: Result, size: int) -> Answer:
     state, device = result.state, result.state.inverse_depth.device
     numbers = [_STATUS.index(result.status), result.iterations, result.initial_cost, result.cost, result.weight_sum]
     numbers += [value for covariance in result.intrinsics_covariances for row in covariance for value in row]
+    # Of several cameras that are held, a result has one covariance for all.
+    numbers += [0.0] * (_NUMBERS + 4 * _num_cameras(state) - len(numbers))
     if result.extrinsic_covariances is not None:
         numbers += result.extrinsic_covariances.flatten().tolist()
     # Where nothing was solved there is less to say.

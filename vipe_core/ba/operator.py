@@ -46,10 +46,17 @@ def solve(problem: Problem, state: State, options: Options | None = None) -> Res
             that is free in some frames only.
     """
     levenberg.require_solvable(problem, state)
+    answer = bundle_adjustment(*_arguments(problem, state, options or Options()))
+    return result_of(Answer(*answer), state)
+
+
+def _arguments(problem: Problem, state: State, options: Options) -> tuple[Any, ...]:
+    """Problem, state and options as the operator takes them: what says how a graph is laid out on the host, all else
+    where the inverse depths are."""
     device = state.inverse_depth.device
-    edges, free, priors, rig, options = problem.edges, problem.free, problem.priors, problem.rig, options or Options()
+    edges, free, priors, rig = problem.edges, problem.free, problem.priors, problem.rig
     log_focal = priors.log_focal
-    answer = bundle_adjustment(
+    return (
         problem.camera_model,
         [problem.grid.height, problem.grid.width],
         [problem.grid.stride, problem.grid.offset],
@@ -84,7 +91,6 @@ def solve(problem: Problem, state: State, options: Options | None = None) -> Res
             options.min_depth_ratio,
         ],
     )
-    return result_of(Answer(*answer), state)
 
 
 def _problem(
@@ -161,7 +167,7 @@ _SCHEMA = (
 
 @torch.library.custom_op("vipe_core::bundle_adjustment", mutates_args=(), device_types="cpu", schema=_SCHEMA)
 def bundle_adjustment(*arguments: Any) -> Answer:
-    """Arguments as of `_problem`. The graph and what is free are on the host, all else where the inverse depths are."""
+    """`Answer` of the arguments that `_arguments` gives."""
     return _descended(*_problem(*arguments))
 
 
