@@ -99,8 +99,7 @@ def annotate(
     from vipe_core.depth.known import KnownLength
     from vipe_core.errors import ConfigError, VipeError
     from vipe_core.formats import SequenceNames
-    from vipe_core.pipeline.annotator import Annotator
-    from vipe_core.pipeline.presets import PresetOptions
+    from vipe_core.pipeline.presets import PresetOptions, resolve
     from vipe_core.video.limits import use_limits
 
     paths = list(inputs or [])
@@ -137,7 +136,11 @@ def annotate(
                 _print_json(row)
         _show(views, output, as_json=as_json, stages=False)
         return
-    annotator = Annotator(preset=preset, camera=camera, device=device, options=options)
+    chosen = resolve(preset, camera, options)
+    # What was asked wrongly is answered before the engine's libraries are loaded, which takes seconds.
+    from vipe_core.pipeline.annotator import Annotator
+
+    annotator = Annotator(preset=chosen, device=device)
     names = SequenceNames(output)
     rows: list[dict[str, Any]] = []
     for path in paths:

@@ -25,7 +25,7 @@ def test_videos_and_images_become_artifacts(vipectl: Run, clip: Path, tmp_path: 
     broken = tmp_path / "broken.mp4"
     broken.write_text("not a video")
 
-    done = vipectl("annotate", clip, broken, images, "-o", "out", "--json")
+    done = vipectl("annotate", clip, broken, images, "-o", "out", "--scale-from", "path=2.5", "--json")
 
     rows = [json.loads(line) for line in done.stdout.splitlines()]
     assert done.returncode == 1, "one input failed"
@@ -35,6 +35,8 @@ def test_videos_and_images_become_artifacts(vipectl: Run, clip: Path, tmp_path: 
     for row, frames in ((rows[0], 16), (rows[2], 10)):
         artifacts = read_artifacts(tmp_path / "out", row["name"])
         assert artifacts.num_frames == row["num_frames"] == frames
+        assert (row["scale"], row["scale_source"]) == ("metric", "path=2.5")
+        assert row["trajectory_length"] == pytest.approx(2.5)
         assert np.isfinite(artifacts.world_from_cam).all()
         assert artifacts.camera.params == pytest.approx(row["camera_params"], rel=1e-6)
         with artifacts.open_depth() as depth:
@@ -46,7 +48,8 @@ def test_videos_and_images_become_artifacts(vipectl: Run, clip: Path, tmp_path: 
     assert sources == {"broken": str(broken), "sideways": str(clip), "sideways-2": str(images)}
 
 
-def test_masks_of_ones_own(vipectl: Run, clip: Path, tmp_path: Path) -> None:
+def test_masks_of_ones_own_and_the_table_for_people(vipectl: Run, clip: Path, tmp_path: Path) -> None:
+    shutil.copyfile(clip, tmp_path / "my clip.mp4")
     masks = tmp_path / "masks"
     masks.mkdir()
     for frame in open_source(clip).frames():
@@ -54,39 +57,19 @@ def test_masks_of_ones_own(vipectl: Run, clip: Path, tmp_path: Path) -> None:
         mask[20:60, 30:90] = 1
         cv2.imwrite(str(masks / f"{frame.index}.png"), mask)
 
-    done = vipectl("annotate", clip, "-o", "out", "--masks", masks, "--json")
+    done = vipectl("annotate", "my clip.mp4", "-o", "out", "--masks", masks)
 
-    assert done.returncode == 0
-    with read_artifacts(tmp_path / "out", json.loads(done.stdout)["name"]).open_mask() as found:
+    assert done.returncode == 0, done.stderr
+    assert "my-clip" in done.stdout
+    assert "192x144" in done.stdout
+    with read_artifacts(tmp_path / "out", "my-clip").open_mask() as found:
         assert all((mask[20:60, 30:90] == 1).all() for mask in found)
     assert vipectl("annotate", clip, clip, "-o", "out", "--masks", masks).returncode == 2
+    assert vipectl("annotate", clip, "-o", "out", "--scale-from", "tall").returncode == 2
     (masks / "0.png").unlink()
     done = vipectl("annotate", clip, "-o", "out", "--masks", masks, "--json")
     assert done.returncode == 1
     assert json.loads(done.stdout)["error"]["code"] == "mask_mismatch"
-
-
-def test_a_known_length_makes_metres(vipectl: Run, clip: Path) -> None:
-    done = vipectl("annotate", clip, "-o", "out", "--scale-from", "path=2.5", "--json")
-    assert done.returncode == 0
-    row = json.loads(done.stdout)
-    assert (row["scale"], row["scale_source"]) == ("metric", "path=2.5")
-    assert row["trajectory_length"] == pytest.approx(2.5)
-    done = vipectl("annotate", clip, "-o", "out", "--scale-from", "depth=2@9000,1,1", "--json")
-    assert json.loads(done.stdout)["error"]["code"] == "scale_unobservable"
-    assert vipectl("annotate", clip, "-o", "out", "--scale-from", "tall").returncode == 2
-
-
-def test_the_table_for_people(vipectl: Run, clip: Path, tmp_path: Path) -> None:
-    shutil.copyfile(clip, tmp_path / "my clip.mp4")
-    done = vipectl("annotate", "my clip.mp4", "-o", "out")
-    assert done.returncode == 0, done.stderr
-    assert "my-clip" in done.stdout
-    assert "192x144" in done.stdout
-    stages = [line.split()[0] for line in done.stdout.splitlines() if line.rstrip().endswith("%")]
-    assert stages[0] == "scan"
-    assert {"track", "backend", "infill", "depth"} <= set(stages)
-    assert (tmp_path / "out/depth/my-clip.zip").is_file()
 
 
 @pytest.mark.parametrize(

@@ -16,7 +16,7 @@ def test_a_folder_of_videos_becomes_a_report(vipectl: Run, clip: Path, tmp_path:
     videos.mkdir()
     shutil.copy(clip, videos / "walk.mp4")
     (videos / "broken.mp4").write_text("not a video")
-    command = ("eval", "--videos", videos, "--max-frames", 8, "--matcher", "sift", "-o", "report")
+    command = ("eval", "--videos", videos, "--max-frames", 5, "--matcher", "sift", "-o", "report")
 
     done = vipectl(*command)
 
@@ -24,7 +24,7 @@ def test_a_folder_of_videos_becomes_a_report(vipectl: Run, clip: Path, tmp_path:
     document = json.loads((tmp_path / "report" / "report.json").read_text())
     broken, walk = document["rows"]
     assert broken["error"]["code"] == "media_corrupt"
-    assert walk["frames"] == 8
+    assert walk["frames"] == 5
     assert walk["figures"]["s_ate"] < 0.1
     assert walk["figures"]["sampson_px"] > 0
     assert document["facts"]["preset"] == "classical"
@@ -43,7 +43,7 @@ def test_a_folder_of_videos_becomes_a_report(vipectl: Run, clip: Path, tmp_path:
 
 @pytest.mark.slow
 def test_the_ablation_is_one_table(vipectl: Run, clip: Path, tmp_path: Path) -> None:
-    done = vipectl("eval", "--videos", clip, "--max-frames", 6, "--ablate", "--no-plots", "-o", "report", timeout_s=600)
+    done = vipectl("eval", "--videos", clip, "--max-frames", 4, "--ablate", "--no-plots", "-o", "report", timeout_s=600)
     assert done.returncode == 0, done.stderr
     document = json.loads((tmp_path / "report" / "report.json").read_text())
     assert list(document["variants"]) == ["dense", "dense-depth", "dense-sparse-depth", "dense-depth-masks", "all"]

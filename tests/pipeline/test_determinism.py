@@ -33,8 +33,8 @@ def clips(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     folder = tmp_path_factory.mktemp("clips")
     paths = {}
     for name, clip in (
-        ("orbit", tiny_clip("dynamic", 14, 192, 144, noise=1.0)),
-        ("other", tiny_clip("forward", 3, 160, 120, noise=1.0)),
+        ("orbit", tiny_clip("dynamic", 12, 160, 120, noise=1.0)),
+        ("other", tiny_clip("forward", 3, 128, 96, noise=1.0)),
     ):
         paths[name] = folder / f"{name}.mp4"
         with VideoWriter(paths[name], clip.fps) as writer:
