@@ -30,7 +30,7 @@ from services.agent.config import AgentConfig
 from services.agent.executor import Died, SlotHandle
 from services.agent.gpus import GpuShares, SlotPlan, gpu_memory_bytes, plan_slots
 from services.agent.messages import Failed, Reply, SlotProgress, Task
-from services.agent.ray_health import RayGate, RayGone, all_alive, answers, head_processes
+from services.agent.ray_health import RayGate, RayGone, all_alive, answers, end_processes, head_processes
 from services.agent.slot import Slot, SlotConfig
 from services.observability.logging import configure_logging
 from vipe_core.errors import ConfigError, EngineError
@@ -338,7 +338,7 @@ class RayExecutor:
                 self._shares = GpuShares(self._plan_gpus(self._gpus_of_the_cluster()))
         import ray
 
-        self._head = head_processes() if self._private else {}
+        self._head = {} if self._temp_dir is None else head_processes(self._temp_dir)
         self._address = ray.get_runtime_context().gcs_address
         self.actor_class = self._new_actor_class()
         self.gate.open()
@@ -354,6 +354,7 @@ class RayExecutor:
             logger.warning("a call into Ray does not return; it is shut down all the same")
         ray.shutdown()
         if self._temp_dir is not None:
+            end_processes(self._temp_dir)
             shutil.rmtree(self._temp_dir, ignore_errors=True)
 
     def _plan_gpus(self, memory_bytes: Sequence[int], cores: int | None = None) -> SlotPlan:

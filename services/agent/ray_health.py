@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import signal
 import socket
 import threading
 import time
@@ -65,15 +66,26 @@ class RayGate:
             return self._changed.wait_for(lambda: self._open, timeout_s)
 
 
-def head_processes() -> dict[int, str]:
-    """(process id -> start time) of the head's processes among the children of this process."""
-    found = {}
-    for folder in Path("/proc").iterdir():
-        if folder.name.isdigit() and (status := _status(int(folder.name))) is not None:
-            name, _, parent, started = status
-            if name in _HEAD_PROCESSES and parent == os.getpid():
-                found[int(folder.name)] = started
-    return found
+def head_processes(temp_dir: Path) -> dict[int, str]:
+    """(process id -> start time) of the head that this process started with that folder."""
+    return {
+        pid: status[3]
+        for pid, status in _processes_of(temp_dir).items()
+        if status[0] in _HEAD_PROCESSES and status[2] == os.getpid()
+    }
+
+
+def end_processes(temp_dir: Path) -> None:
+    """Kill what is left of a private Ray with that folder, and reap it.
+
+    Ray ends its processes itself, but not those of a start that failed half-way: they would run as long as this one.
+    """
+    for pid, (_, _, parent, _) in _processes_of(temp_dir).items():
+        with contextlib.suppress(ProcessLookupError, PermissionError):
+            os.kill(pid, signal.SIGKILL)
+        if parent == os.getpid():
+            with contextlib.suppress(ChildProcessError):
+                os.waitpid(pid, 0)
 
 
 def all_alive(processes: dict[int, str]) -> bool:
@@ -96,6 +108,20 @@ def answers(address: str, patience_s: float = 10.0) -> bool:
         if time.monotonic() >= deadline:
             return False
         time.sleep(0.5)
+
+
+def _processes_of(temp_dir: Path) -> dict[int, tuple[str, str, int, str]]:
+    """The living processes whose command line names a Ray's own folder, but this one; see `_status`."""
+    found = {}
+    for folder in Path("/proc").iterdir():
+        if not folder.name.isdigit() or int(folder.name) == os.getpid():
+            continue
+        with contextlib.suppress(OSError):  # It has ended meanwhile, or is somebody else's.
+            named = os.fsencode(f"{temp_dir}/") in (folder / "cmdline").read_bytes()
+            status = _status(int(folder.name)) if named else None
+            if status is not None:
+                found[int(folder.name)] = status
+    return found
 
 
 def _status(pid: int) -> tuple[str, str, int, str] | None:

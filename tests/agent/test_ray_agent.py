@@ -20,7 +20,7 @@ from services.agent.agent import Agent
 from services.agent.config import AgentConfig
 from services.agent.executor import Died
 from services.agent.messages import Annotated, AnnotateVideo, Cancelled, Opened, OpenShard, Reply
-from services.agent.ray_executor import RayExecutor, RaySlot
+from services.agent.ray_executor import RayExecutor, RaySlot, private_temp_dir
 from services.agent.ray_health import head_processes
 from services.commit.reconcile import committed_records
 from services.domain.models import Job, JobSpec, ShardPlan, VideoRef, VideoResult, video_key
@@ -44,7 +44,7 @@ def _config(root: Path) -> AgentConfig:
     return AgentConfig(scratch_dir=root / "scratch", engine="agent_engines:open_in_process", poll_s=0.2)
 
 
-def _wait(condition: Callable[[], bool], what: str, seconds: float = 90.0) -> None:
+def _wait(condition: Callable[[], bool], what: str, seconds: float = 240.0) -> None:
     deadline = time.monotonic() + seconds
     while not condition():
         if time.monotonic() > deadline:
@@ -216,7 +216,8 @@ def test_the_loss_of_the_head_costs_the_running_video_and_blames_nobody(tmp_path
     agent.start()
     try:
         _wait(lambda: count.exists() and "b-" in count.read_text(), "the second video to begin")
-        heads = [pid for pid in head_processes() if Path(f"/proc/{pid}/comm").read_text().strip() in victims]
+        ray_dir = private_temp_dir(config.scratch_dir.parent)
+        heads = [pid for pid in head_processes(ray_dir) if Path(f"/proc/{pid}/comm").read_text().strip() in victims]
         assert len(heads) == len(victims)
         for pid in heads:
             os.kill(pid, signal.SIGKILL)
