@@ -30,7 +30,8 @@ class JobRequest(ControlFields):
         min_length=1,
         max_length=1000,
         description="Each a directory, a video file, `s3://bucket/key`, `s3://bucket/prefix/` (trailing slash), "
-        "`http(s)://host/path` where the operator allows the host, or a list of videos in one of these places: `.csv`, "
+        "`http(s)://host/path` where the operator allows the host, the file of a rig (`rig.json`, `*.rig.json`), which "
+        "names the videos of its views, or a list of videos in one of these places: `.csv`, "
         "`.jsonl` or `.parquet` with a column `uri`, and `key`, `size_bytes` and `etag` where they are known.",
     )
     output: Address = Field(description="A directory or `s3://bucket/prefix` that belongs to this job alone.")

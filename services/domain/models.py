@@ -23,7 +23,8 @@ class JobSpec:
 
     Attributes:
         inputs: Each a directory, a video file, `s3://bucket/key`, `s3://bucket/prefix/` (trailing slash),
-            `http(s)://host/path`, or a list of videos (`.csv`, `.jsonl`, `.parquet`) in one of these places.
+            `http(s)://host/path`, the file of a rig (`is_rig`), or a list of videos (`.csv`, `.jsonl`, `.parquet`) in
+            one of these places.
         output: A directory or `s3://bucket/prefix` that belongs to this job alone.
         preset: Engine preset.
         camera: Camera model.

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import os
+import shutil
 import signal
 import socket
 import subprocess
@@ -20,7 +22,7 @@ import pytest
 from cli_helpers import VIPECTL, Run
 
 from services.client import Client
-from services.dataset import verify
+from services.dataset import iterate, verify
 from services.storage import open_store
 
 pytestmark = pytest.mark.slow
@@ -138,6 +140,22 @@ def test_commands_of_a_running_service(service: Service, clip: Path, vipectl: Ru
     assert "job_not_cancellable" in done.stderr
     done = vipectl("submit", clip, "-o", "out", *api)
     assert "output_in_use" in done.stderr
+
+    views = []
+    for name in ("left", "right"):
+        shutil.copy(clip, tmp_path / f"{name}.mp4")
+        views.append({"name": name, "video": f"{name}.mp4", "rig_from_cam": np.eye(4).tolist()})
+    (tmp_path / "car.rig.json").write_text(json.dumps({"version": 1, "intrinsics": "shared", "views": views}))
+    spec = {"inputs": [str(tmp_path / "car.rig.json")], "output": str(tmp_path / "rigs"), "attributes": ["pose"]}
+    rigs = service.client.submit(spec)["id"]
+    wait_for(lambda: service.client.job(rigs)["finished_at"], "the job of a rig to end")
+    assert service.client.job(rigs)["state"] == "succeeded"
+    report = verify(open_store(str(tmp_path / "rigs")), deep=True)
+    assert report.ok, report.problems
+    assert (report.totals.videos, report.totals.frames) == (1, 32)
+    left, right = iterate(open_store(str(tmp_path / "rigs")))
+    assert (left.row["view"], right.row["view"]) == ("left", "right")
+    np.testing.assert_allclose(left.world_from_cam, right.world_from_cam, atol=1e-6)
 
     done = vipectl("unpack", "out", "artifacts")
     assert done.returncode == 0, done.stderr

@@ -13,7 +13,7 @@ from vipe_core.quality import assess
 from vipe_core.slam.diagnostics import LoopReport, MapReport
 from vipe_core.slam.infill import Trajectory
 from vipe_core.slam.settings import SlamSettings
-from vipe_core.slam.system import SlamResult
+from vipe_core.slam.system import SlamResult, ViewOfRig
 from vipe_core.slam.working import WorkingSize
 from vipe_core.slam.zoom import Zoom
 
@@ -68,6 +68,20 @@ def good(**changes: object) -> SlamResult:
 
 def verdict(result: SlamResult) -> Quality:
     return assess(result, SlamSettings(), source_width=640)
+
+
+@pytest.mark.parametrize(
+    ("view", "reliable", "reasons"),
+    [
+        (ViewOfRig(rotation_sigma_deg=0.2, place_sigma=0.01), "yes", ()),
+        (ViewOfRig(rotation_sigma_deg=0.8, place_sigma=0.01), "doubtful", ("extrinsics_unobserved",)),
+        (ViewOfRig(blind=True), "no", ("blind_view",)),
+    ],
+)
+def test_a_view_of_a_rig_has_reasons_of_its_own(view: ViewOfRig, reliable: str, reasons: tuple[str, ...]) -> None:
+    nothing = good_map(residual_px=float("nan"), inlier_ratio=0.0, coverage=0.0)
+    quality = verdict(good(rig=view, map=nothing if view.blind else good_map()))
+    assert (quality.reliable, quality.reasons) == (reliable, reasons)
 
 
 def test_a_good_result_is_reliable_and_its_residual_is_in_source_pixels() -> None:

@@ -44,6 +44,13 @@ def path_error(rig: ExactRig, found: RigSlamResult) -> tuple[float, float]:
     return error / length, fit.scale
 
 
+class HalfBlindRig(ExactRig):
+    """Its second view never moves."""
+
+    def motion_px(self, source: int, target: int) -> float:
+        return 0.0 if source % self.num_views else super().motion_px(source, target)
+
+
 class AskedRig(ExactRig):
     """Remembers which pictures were matched."""
 
@@ -81,6 +88,19 @@ def test_wrong_extrinsics_are_found_out() -> None:
     assert path_error(rig, found)[0] < 2e-3
     assert angle_between_deg(found.cam_from_rig[0], rig.cam_from_rig[0]) < 1e-4
     assert angle_between_deg(found.cam_from_rig[1], rig.cam_from_rig[1]) < 0.1
+
+
+def test_a_view_that_stands_still_while_the_other_moves_is_left_out() -> None:
+    rig = HalfBlindRig(PATH, fan_of_cameras(2, 0.2, 0.0))
+    found = run(rig, RigCameras(rig.cam_from_rig, (CAMERA, CAMERA)))
+    assert [view.rig.blind for view in found.views if view.rig] == [False, True]
+    # One view alone says nothing of the scale, and so of the place of the other one.
+    truth = inverse(rig.cam_from_world)[::2, :3, 3]
+    fit = umeyama(found.views[0].world_from_cam[:, :3, 3], truth)
+    np.testing.assert_allclose(fit.apply(found.views[0].world_from_cam[:, :3, 3]), truth, atol=1e-3)
+    assert found.scale_sigma_ratio > 0.2
+    assert found.views[1].map.coverage == 0
+    assert not found.views[1].trajectory.interpolated.any()
 
 
 def test_cameras_in_one_place_turn_as_one_and_tell_no_scale() -> None:
