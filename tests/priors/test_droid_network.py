@@ -124,13 +124,13 @@ def test_cells_are_centred_on_their_sample_points() -> None:
 
 def test_lean_and_full_refinements_say_the_same_and_forget_what_they_are_told_to(network: DroidNetwork) -> None:
     matcher = DroidMatcher(network)
-    frames = [matcher.encode(working(seed, seed)) for seed in range(12)]
+    frames = [matcher.encode(working(seed, seed)) for seed in range(9)]
     grid = frames[0].grid
-    ends = [(i, j) for i in range(12) for j in (i - 1, i + 1) if 0 <= j < 12]
+    ends = [(i, i - 1) for i in range(1, 9)] + [(0, 1), (3, 4), (8, 6)]
     seen = grid.sample_px(torch.float32) + torch.linspace(-5, 5, len(ends))[:, None, None]
     answers = []
     for lean in (False, True):
-        refinement = matcher.begin(grid, lean=lean)
+        refinement = matcher.begin(grid, lean=lean, spilled=lean)
         refinement.add([(frames[i], frames[j]) for i, j in ends[:-1]], seen[:-1])
         refinement.add([(frames[i], frames[j]) for i, j in ends[-1:]], seen[-1:])
         refinement.update(seen, [i for i, _ in ends])
@@ -145,6 +145,30 @@ def test_lean_and_full_refinements_say_the_same_and_forget_what_they_are_told_to
     torch.testing.assert_close(full.target_px, lean_answer.target_px, atol=2e-3, rtol=0)
     torch.testing.assert_close(full.weight, lean_answer.weight, atol=1e-4, rtol=0)
     torch.testing.assert_close(full.damping, lean_answer.damping, atol=1e-3, rtol=1e-4)
+
+
+def test_graphs_get_shapes_that_repeat_and_the_filling_changes_nothing(network: DroidNetwork) -> None:
+    shapes = []
+
+    def captured(*inputs: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        shapes.append([tuple(given.shape[:2]) for given in (inputs[0], inputs[-1])])
+        return network._step(*inputs)
+
+    rng = np.random.default_rng(6)
+    for edges, sources in ((3, (7, 2, 7)), (16, tuple(range(8)) * 2), (17, (1,) * 17)):
+        hidden, context = np.tanh(rng.standard_normal((2, edges, 128, 1, 2)))
+        correlation, motion = rng.standard_normal((edges, 196, 1, 2)), rng.uniform(-9, 9, (edges, 4, 1, 2))
+        inputs = [torch.from_numpy(x).float() for x in (hidden, context, correlation, motion)]
+        share = shares(torch.tensor(sources))[1]
+        plain = network.step(*inputs, share)
+        network._graphs = captured
+        try:
+            filled = network.step(*inputs, share)
+        finally:
+            network._graphs = None
+        for name in ("hidden", "delta", "weight", "damping"):
+            torch.testing.assert_close(getattr(filled, name), getattr(plain, name), atol=1e-6, rtol=1e-5)
+    assert shapes == [[(16, 128), (8, 16)], [(16, 128), (8, 16)], [(32, 128), (8, 32)]]
 
 
 def test_an_overflow_is_no_measurement_and_does_not_stay(network: DroidNetwork) -> None:
