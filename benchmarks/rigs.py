@@ -114,7 +114,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             )
             runs.append(run)
         table.add_section()
-    Console(width=110).print(table)
+    Console(width=150).print(table)
     if arguments.json:
         arguments.json.write_text(json.dumps([asdict(run) for run in runs], indent=1) + "\n")
     return 0
