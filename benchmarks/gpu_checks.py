@@ -12,8 +12,8 @@
     pipeline    `python -m benchmarks.gpu_pipeline`, with short clips
 
 Every section runs in a process of its own under a time limit and survives the failure of another; those that measure no
-time run side by side. What they print is in `--output FOLDER`, its end on the terminal, a summary last. Without a GPU
-it says so and does nothing. `--vipe FOLDER` and `--droid FOLDER` are handed to the benchmarks.
+time run side by side. What they print is kept in `--output FILE`, its end on the terminal, a summary last. Without a
+GPU it says so and does nothing. `--vipe FOLDER` and `--droid FOLDER` are handed to the benchmarks.
 """
 
 from __future__ import annotations
@@ -392,7 +392,9 @@ def _run(section: Section, end: float, output: Path | None) -> Outcome:
         said, _ = process.communicate()
         outcome = "out of time"
     if output is not None:
-        (output / f"{section.name.replace(' ', '-')}.log").write_text(said)
+        # In one piece, whatever runs beside it.
+        with output.open("a") as log:
+            log.write(f"=== {section.name}: {outcome}\n{said}\n")
     found = Outcome(section.name, outcome, time.monotonic() - start, said.strip(), section.shown)
     print(f"{found.name}: {found.outcome} after {found.seconds:.0f} s", flush=True)
     return found
@@ -402,7 +404,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     parser.add_argument("--vipe", type=Path, metavar="FOLDER")
     parser.add_argument("--droid", type=Path, metavar="FOLDER")
-    parser.add_argument("--output", type=Path, metavar="FOLDER", help="where everything that is said is kept")
+    parser.add_argument("--output", type=Path, metavar="FILE", help="everything that is said is added to it")
     parser.add_argument("--seconds", type=float, default=560.0, help="in all")
     parser.add_argument("--check", choices=CHECKS, help="this check only, in this process")
     arguments = parser.parse_args(argv)
@@ -413,8 +415,6 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(CHECKS[arguments.check]())
         return 0
     end = time.monotonic() + arguments.seconds
-    if arguments.output is not None:
-        arguments.output.mkdir(parents=True, exist_ok=True)
     outcomes: list[Outcome] = []
     for group in _sections(arguments.vipe, arguments.droid):
         with ThreadPoolExecutor(len(group)) as pool:

@@ -31,7 +31,7 @@ def test_the_sections_are_checks_that_there_are_and_fit_ten_minutes() -> None:
 
 def _run(code: str, tmp_path: Path, limit_s: float = 30.0, left_s: float = 30.0) -> Outcome:
     section = Section("a section", [sys.executable, "-u", "-c", code], limit_s)
-    return gpu_checks._run(section, time.monotonic() + left_s, tmp_path)
+    return gpu_checks._run(section, time.monotonic() + left_s, tmp_path / "log")
 
 
 def test_a_section_survives_what_it_runs(tmp_path: Path) -> None:
@@ -40,7 +40,8 @@ def test_a_section_survives_what_it_runs(tmp_path: Path) -> None:
     failed = _run("print('so far'); raise SystemError('why')", tmp_path)
     assert failed.outcome == "failed (1)"
     assert failed.said.endswith("SystemError: why")
-    assert (tmp_path / "a-section.log").read_text().startswith("so far")
+    log = (tmp_path / "log").read_text()
+    assert log.startswith("=== a section: passed\nfine\n\n=== a section: failed (1)\nso far\n")
     # A child that holds the output open is ended as well.
     late = _run("import os, time; print('begun'); os.fork(); time.sleep(60)", tmp_path, limit_s=1.0)
     assert (late.outcome, late.said) == ("out of time", "begun")

@@ -1,6 +1,7 @@
-"""The normal equations of dense bundle adjustment, reduced to poses and intrinsics, in torch: the solver for a GPU.
+"""The normal equations of dense bundle adjustment, reduced to poses and intrinsics, in torch, on any device.
 
-On a CPU `host_solver.py` does the same with compiled loops.
+It solves what neither the compiled loops of a CPU (`host_solver.py`) nor the kernels of a GPU (`cuda/`) are for, and is
+what both are held to.
 
 Problem. Minimise over poses G_i = cam_from_world, intrinsics k = (log f, alpha) and one inverse depth d per cell
 

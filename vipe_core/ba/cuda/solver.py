@@ -20,7 +20,7 @@ from vipe_core.ba.answer import Answer, report_size
 from vipe_core.ba.cuda.compiler import ROBUST_CODE, Specialisation
 from vipe_core.ba.cuda.context import CONTROL_BYTES, Context
 from vipe_core.ba.cuda.launcher import Launcher
-from vipe_core.ba.cuda.layout import LARGE_SHARED_BYTES, SIDE, TILE, TILE_THREADS, Layout, Unknowns, build_layout
+from vipe_core.ba.cuda.layout import LARGE_SHARED_BYTES, SIDE, SLICE, TILE, TILE_THREADS, Layout, Unknowns, build_layout
 from vipe_core.ba.problem import Options, Problem, State
 from vipe_core.ba.rigs import unknowns_of
 from vipe_core.ba.solver import MIN_DAMPING
@@ -129,7 +129,7 @@ class Adjustment:
 
     @property
     def _slices(self) -> int:
-        return -(-self._problem.grid.num_cells // 256)
+        return -(-self._problem.grid.num_cells // SLICE)
 
     def _upload(self, layout: Layout) -> None:
         """All tables in one copy."""
