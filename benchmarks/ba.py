@@ -199,10 +199,14 @@ def _stepping(kind: type[HostSolver] | type[TorchSolver], problem: Problem, stat
 
 
 def measure(
-    size: Size, device: torch.device, repeats: int, vipe: dict[str, Any] | None, droid: Droid | None
+    host_problem: Problem,
+    host_state: State,
+    device: torch.device,
+    repeats: int,
+    vipe: dict[str, Any] | None,
+    droid: Droid | None,
 ) -> Iterator[Timed]:
-    """Every solver on a graph of a size."""
-    host_problem, host_state = problem_of(size, torch.device("cpu"))
+    """Every solver on a problem, moved to a device."""
     problem, state = placed(host_problem, host_state, device)
     judge = HostSolver(host_problem, _OPTIONS, host_state)
 
@@ -227,7 +231,7 @@ def measure(
     problem = replace(problem, edges=edges)
     if vipe is not None:
         yield timed("nvidia-vipe", vipe_ba.iteration(vipe, problem, state, _DAMPING), max(repeats // 2, 1))
-    if droid is not None and not size.focal:
+    if droid is not None and not problem.free.focal:
         yield timed(droid.name, droid.iteration(problem, state, _DAMPING), max(repeats // 2, 1))
 
 
@@ -273,10 +277,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     print(f"{name}: {rate[0] / 1e9:.0f} Gflop/s, {rate[1] / 1e9:.1f} GB/s")
     print(f"{'graph':<20} {'solver':<24}{'ms/iteration':>13}{'peer / this':>13}{'this / floor':>14}{'cost':>9}")
     for size in sizes:
-        problem, _ = problem_of(size, torch.device("cpu"))
+        problem, state = problem_of(size, torch.device("cpu"))
         least = work(size, torch.bincount(problem.edges.source, minlength=size.frames))
         graph = f"{size.frames} x {size.edges}{', focal' if size.focal else ''}"
-        rows = list(measure(size, device, repeats, vipe, droid))
+        rows = list(measure(problem, state, device, repeats, vipe, droid))
         peer = min((row.seconds for row in rows if "vipe" in row.solver or "DROID" in row.solver), default=None)
         for row in rows:
             floor = (least.assembly_seconds if row.assembly else least.seconds)(*rate)
