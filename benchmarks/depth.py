@@ -43,7 +43,7 @@ from benchmarks.long_video import Looped
 from benchmarks.peers.stereo import stereo_depth
 from benchmarks.sequences import DATA, BenchSequence, find_sequence
 from vipe_core.annotation import depth_kind_of
-from vipe_core.depth.geometry import KeyframePrior, length_of, relative
+from vipe_core.depth.geometry import KeyframePrior, length_of
 from vipe_core.depth.scene import scene_of
 from vipe_core.depth.stream import DenseDepth
 from vipe_core.depth.types import DepthFrame, DepthSettings, SceneMap
@@ -56,6 +56,7 @@ from vipe_core.evaluation.metrics import (
     trajectory_errors,
 )
 from vipe_core.evaluation.truth import GroundTruth, read_truth, sample_at_truth
+from vipe_core.geometry.arrays import inverse
 from vipe_core.pipeline.annotator import Annotator
 from vipe_core.priors.classical import classical_priors
 from vipe_core.slam.system import Slam
@@ -239,7 +240,7 @@ def followed(frame: DepthFrame, after: DepthFrame, scene: SceneMap) -> NDArray[n
     rows, cols = np.mgrid[half:height:_FOLLOW_STEP_PX, half:width:_FOLLOW_STEP_PX]
     rays = camera.unproject(np.stack([cols, rows], axis=-1).astype(np.float64))
     length = length_of(camera, rays)
-    motion = relative(scene.world_from_cam, frame.index, after.index)
+    motion = inverse(scene.world_from_cam[after.index]) @ scene.world_from_cam[frame.index]
     points = rays * (frame.depth[rows, cols] / length)[..., None] @ motion[:3, :3].T + motion[:3, 3]
     px, imaged = camera.project(points)
     at = np.rint(np.where(imaged[..., None], px, -1)).astype(np.int64)

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vipe_core.cameras import Camera
-from vipe_core.depth.geometry import relative
+from vipe_core.geometry.arrays import inverse
 
 # Parallax of the median depth that is looked for, as a share of the width, and the least angle between the baseline and
 # the optical axis at which a picture can still be rectified.
@@ -45,7 +45,7 @@ def stereo_depth(
     partner = _partner(index, world_from_cam, camera, median_depth)
     if partner is None:
         return None
-    motion = relative(world_from_cam, index, partner)
+    motion = inverse(world_from_cam[partner]) @ world_from_cam[index]
     # The baseline: centre of the partner as the frame sees it.
     baseline = -motion[:3, :3].T @ motion[:3, 3]
     length = float(np.linalg.norm(baseline))
@@ -93,7 +93,7 @@ def _partner(index: int, world_from_cam: NDArray[np.float64], camera: Camera, me
     wanted = _PARALLAX * camera.width / camera.focal_px * median_depth
     best: tuple[float, int] | None = None
     for j in range(max(0, index - _NEIGHBOURS), min(len(world_from_cam), index + _NEIGHBOURS + 1)):
-        motion = relative(world_from_cam, index, j)
+        motion = inverse(world_from_cam[j]) @ world_from_cam[index]
         baseline = -motion[:3, :3].T @ motion[:3, 3]
         length = float(np.linalg.norm(baseline))
         if j == index or length < 1e-9:

@@ -17,7 +17,6 @@ from vipe_core.cameras.along import inverse_along
 from vipe_core.depth.ground import scale_from_height
 from vipe_core.depth.known import KnownLength
 from vipe_core.depth.projection import MapProjector
-from vipe_core.depth.robust import consensus, weighted_median
 from vipe_core.depth.scale import (
     FrameRatio,
     normalised,
@@ -33,6 +32,7 @@ from vipe_core.errors import ConfigError, ScaleUnobservable
 from vipe_core.evaluation.synthetic import SyntheticClip, tiny_clip
 from vipe_core.geometry.arrays import inverse
 from vipe_core.priors.protocols import MetricEstimate
+from vipe_core.statistics import consensus, weighted_median
 
 
 @pytest.fixture(scope="module")

@@ -141,7 +141,7 @@ def test_euroc_layout(tmp_path: Path) -> None:
     assert sequence.truth.frame_index.tolist() == [1, 2, 3, 4]
     np.testing.assert_allclose(sequence.truth.world_from_cam, poses, atol=1e-6)
     assert sequence.truth.camera is not None
-    assert sequence.truth.camera.params == (45.8, 45.7, 31.7, 24.8)
+    assert sequence.truth.camera.params == (45.8, 45.7, 31.7 + 0.5, 24.8 + 0.5)  # published for integer centres
     frames = list(sequence.pictures.open().frames())
     assert [round(frame.rgb[20:28, 28:36].mean() / 10) for frame in frames] == list(range(COUNT))
     assert [frame.timestamp_s for frame in frames] == pytest.approx([k / 20 for k in range(COUNT)])

@@ -14,7 +14,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from vipe_core.depth.robust import MAD_TO_SIGMA, weighted_median
+from vipe_core.statistics import MAD_TO_SIGMA, weighted_median
 
 Array = NDArray[Any]
 Affine = tuple[float, float]

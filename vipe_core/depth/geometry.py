@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from vipe_core.cameras import MODEL_CODE, Camera
 from vipe_core.depth.seam import Seam
 from vipe_core.depth.types import DepthSettings, SceneMap
+from vipe_core.geometry.arrays import inverse
 
 Array = NDArray[Any]
 
@@ -52,16 +53,6 @@ class View:
             beside_pole = np.sin((np.arange(camera.height) + 0.5) / camera.height * np.pi)
             stretch = np.clip(np.rint(1 / beside_pole), 1, _MAX_STRETCH).astype(np.int64)
         return cls(camera, MODEL_CODE[camera.model], params, np.ascontiguousarray(rays), stretch)
-
-
-def relative(world_from_cam: Array, source: int, target: int) -> NDArray[np.float64]:
-    """(4, 4) target_from_source."""
-    pose = world_from_cam[target]
-    rotation = pose[:3, :3].T
-    out = np.eye(4)
-    out[:3, :3] = rotation @ world_from_cam[source][:3, :3]
-    out[:3, 3] = rotation @ (world_from_cam[source][:3, 3] - pose[:3, 3])
-    return out
 
 
 def length_of(camera: Camera, points: Array) -> NDArray[np.float64]:
@@ -133,7 +124,7 @@ class KeyframePrior:
     def _carried(self, k: int, frame: int) -> tuple[Array, Array, Array]:
         scene = self._scene
         height, width = self._rays.shape[:2]
-        motion = relative(scene.world_from_cam, int(scene.keyframes[k]), frame)
+        motion = inverse(scene.world_from_cam[frame]) @ scene.world_from_cam[scene.keyframes[k]]
         d = scene.inverse_depth[k].astype(np.float64)
         points = self._rays @ motion[:3, :3].T + d[..., None] * motion[:3, 3]
         px, imaged = self._camera.project(points)
@@ -191,7 +182,7 @@ def choose_sources(scene: SceneMap, view: View, prior: Prior, frame: int, settin
     cell_rows = np.clip((px[:, 1] * prior.inverse_depth.shape[0] / camera.height).astype(int), 0, None)
     cell_cols = np.clip((px[:, 0] * prior.inverse_depth.shape[1] / camera.width).astype(int), 0, None)
     d = prior.inverse_depth[cell_rows, cell_cols].astype(np.float64)
-    motion = np.stack([relative(scene.world_from_cam, frame, int(j)) for j in candidates])
+    motion = inverse(scene.world_from_cam[candidates]) @ scene.world_from_cam[frame]
     turned = np.einsum("nij,pj->npi", motion[:, :3, :3], rays)
     seen, imaged = camera.project(turned + d[None, :, None] * motion[:, None, :3, 3])
     unmoved, _ = camera.project(turned)

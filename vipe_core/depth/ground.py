@@ -15,10 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vipe_core.depth.projection import MapProjector
-from vipe_core.depth.robust import consensus
 from vipe_core.depth.scale import FrameRatio, ScaleEstimate, scale_from_ratios
 from vipe_core.depth.types import SceneMap
 from vipe_core.errors import ScaleUnobservable
+from vipe_core.statistics import consensus
 
 Array = NDArray[Any]
 

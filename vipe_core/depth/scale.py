@@ -17,11 +17,11 @@ from numpy.typing import NDArray
 
 from vipe_core.annotation import DepthKind
 from vipe_core.cameras.along import inverse_along
-from vipe_core.depth.robust import consensus, weighted_median, weighted_spread
 from vipe_core.depth.types import SceneMap
 from vipe_core.errors import ScaleUnobservable
 from vipe_core.geometry.arrays import inverse
 from vipe_core.priors.protocols import MetricEstimate
+from vipe_core.statistics import consensus, weighted_median, weighted_spread
 
 Array = NDArray[Any]
 

@@ -20,7 +20,7 @@ from scipy.ndimage import distance_transform_edt
 from vipe_core.ba.problem import Grid
 from vipe_core.depth.completion import complete
 from vipe_core.depth.consistency import Confirmed, confirm
-from vipe_core.depth.geometry import KeyframePrior, Prior, choose_sources, relative
+from vipe_core.depth.geometry import KeyframePrior, Prior, choose_sources
 from vipe_core.depth.moving import stand
 from vipe_core.depth.seam import Seam
 from vipe_core.depth.sky import find_sky
@@ -28,6 +28,7 @@ from vipe_core.depth.sweep import PlaneSweep, RawDepth
 from vipe_core.depth.types import FILLED, MEASURED, MOVING, SKY, UNOBSERVED, DepthFrame, DepthSettings, SceneMap
 from vipe_core.depth.upsampling import upsample
 from vipe_core.errors import EngineError
+from vipe_core.geometry.arrays import inverse
 from vipe_core.slam.segmentation import segment
 from vipe_core.video.source import Frame, FrameSource
 
@@ -132,7 +133,7 @@ class DenseDepth:
         if raw.measured:
             start, stop = scene.shot_of(index)
             others = [
-                (relative(scene.world_from_cam, index, j), raws[j])
+                (inverse(scene.world_from_cam[j]) @ scene.world_from_cam[index], raws[j])
                 for j in (index + sign * distance for distance in settings.check_frames for sign in (-1, 1))
                 if start <= j < stop and raws[j].measured
             ]

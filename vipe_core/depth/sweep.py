@@ -11,11 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vipe_core.depth.aggregation import add_prior, aggregate, winner
-from vipe_core.depth.geometry import Prior, View, relative
+from vipe_core.depth.geometry import Prior, View
 from vipe_core.depth.kernels import sweep_cost
 from vipe_core.depth.seam import Seam
 from vipe_core.depth.types import DepthSettings, SceneMap
 from vipe_core.depth.upsampling import upsample
+from vipe_core.geometry.arrays import inverse
 
 Array = NDArray[Any]
 
@@ -84,9 +85,9 @@ class PlaneSweep:
         settings, seam = self._settings, self.seam
         half, inverse_depth = seam.around(half), seam.around(prior.inverse_depth)
         height, width = half.shape
-        motion = [relative(self._scene.world_from_cam, frame, j) for j in sources]
-        rotations = np.array([m[:3, :3] for m in motion], np.float32)
-        translations = np.array([m[:3, 3] for m in motion], np.float32)
+        poses = self._scene.world_from_cam
+        motion = (inverse(poses[list(sources)]) @ poses[frame]).astype(np.float32)
+        rotations, translations = np.ascontiguousarray(motion[:, :3, :3]), np.ascontiguousarray(motion[:, :3, 3])
 
         def cost_of(view: View, gray: Array, base: Array, step: Array, offsets: Array, images: Array, r: int) -> Array:
             return np.asarray(

@@ -31,6 +31,11 @@ def inverse(transform: ArrayLike) -> Float64Array:
     return np.asarray(se3.inverse(_tensor(transform)).numpy())
 
 
+def relative(target_from_world: ArrayLike, source_from_world: ArrayLike) -> Float64Array:
+    """`se3.relative`: (..., 4, 4), (..., 4, 4) -> (..., 4, 4) target_from_source."""
+    return np.asarray(se3.relative(_tensor(target_from_world), _tensor(source_from_world)).numpy())
+
+
 def interpolate_trajectory(
     times: ArrayLike, poses: ArrayLike, query_times: ArrayLike, *, extrapolate: bool = False
 ) -> Float64Array:

@@ -18,12 +18,13 @@ import poselib
 from numpy.typing import NDArray
 
 from vipe_core.cameras.ideal import ideal_camera, ideal_px
+from vipe_core.geometry.arrays import relative
 from vipe_core.geometry.sim3 import Sim3
 from vipe_core.slam.adjustment import REFINE, Adjuster
 from vipe_core.slam.measuring import MeasuredGraph
 from vipe_core.slam.places import similarity
 from vipe_core.slam.posegraph import SimLink, relax
-from vipe_core.slam.reprojection import Reprojector, relative_pose
+from vipe_core.slam.reprojection import Reprojector
 
 logger = logging.getLogger(__name__)
 
@@ -275,8 +276,8 @@ class LoopCloser:
                 weight[pair] = weight.get(pair, 0.0) + mass
         links = []
         for (i, j), mass in sorted(weight.items()):
-            relative = relative_pose(poses[j], poses[i])
-            links.append(SimLink(i, j, Sim3(1.0, relative[:3, :3], relative[:3, 3]), mass))
+            j_from_i = relative(poses[j], poses[i])
+            links.append(SimLink(i, j, Sim3(1.0, j_from_i[:3, :3], j_from_i[:3, 3]), mass))
         return links
 
     def _apply(self, nodes: Sequence[Sim3]) -> None:

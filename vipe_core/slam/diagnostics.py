@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vipe_core.geometry import umeyama
-from vipe_core.geometry.arrays import inverse
+from vipe_core.geometry.arrays import inverse, relative
 from vipe_core.slam.graph import Graph
 from vipe_core.slam.keyframes import KeyframeMap, Snapshot
-from vipe_core.slam.reprojection import Reprojector, relative_pose
+from vipe_core.slam.reprojection import Reprojector
 
 Array = NDArray[Any]
 
@@ -82,10 +82,10 @@ def examine(reprojector: Reprojector, keyframes: KeyframeMap, graph: Graph, robu
     errors: list[list[Array]] = [[] for _ in range(count)]
     for i, j in graph:
         match = graph[i, j]
-        relative = relative_pose(keyframes.pose(j), keyframes.pose(i))
+        target_from_source = relative(keyframes.pose(j), keyframes.pose(i))
         depth = keyframes.depth(i)
         seen_from, seen_in = keyframes.intrinsics_at(i), keyframes.intrinsics_at(j)
-        induced = reprojector.induced(seen_from, relative, depth, into=seen_in)
+        induced = reprojector.induced(seen_from, target_from_source, depth, into=seen_in)
         weight = match.weight.mean(axis=1)
         use = (weight > _MIN_WEIGHT) & np.isfinite(induced.target_px).all(axis=1)
         if not use.any():
@@ -99,11 +99,11 @@ def examine(reprojector: Reprojector, keyframes: KeyframeMap, graph: Graph, robu
         link[first:last] = np.maximum(link[first:last], float(inlier.mean()))
         covered[i] |= inlier
         # Change of the projection with log depth: what this edge knows about the cell's depth.
-        moved = reprojector.induced(seen_from, relative, depth * np.exp(_LOG_STEP), into=seen_in)
+        moved = reprojector.induced(seen_from, target_from_source, depth * np.exp(_LOG_STEP), into=seen_in)
         slope = np.linalg.norm(moved.target_px - induced.target_px, axis=1) / _LOG_STEP
         information[i] += np.where(inlier & np.isfinite(slope), weight * slope**2, 0.0)
         if inlier.any():
-            angle = reprojector.parallax_deg(seen_from, relative, depth)
+            angle = reprojector.parallax_deg(seen_from, target_from_source, depth)
             parallax[i] = max(parallax[i], float(np.median(angle[inlier])))
     sigma = 1.0 / np.sqrt(np.maximum(information, 1e-12))
     confidence = 1.0 / (1.0 + np.square(sigma / _SURE_LOG_DEPTH))
@@ -162,7 +162,7 @@ def examine_loops(
         match = graph[i, j]
         use = match.weight.mean(axis=1) > _MIN_WEIGHT
         seen_from, seen_in = (per_view[k % len(per_view)] for k in (i, j))
-        old = reprojector.induced(seen_from, relative_pose(poses[j], poses[i]), depths[i], into=seen_in)
+        old = reprojector.induced(seen_from, relative(poses[j], poses[i]), depths[i], into=seen_in)
         new = reprojector.edge(keyframes, i, j)
         for induced, errors in ((old, errors_before), (new, errors_after)):
             error = np.linalg.norm(induced.target_px[use] - match.target_px[use], axis=1)

@@ -13,7 +13,7 @@ import torch
 from numpy.typing import NDArray
 
 from vipe_core.ba.problem import Edges, Free, Problem, State
-from vipe_core.geometry.arrays import interpolate_trajectory
+from vipe_core.geometry.arrays import interpolate_trajectory, relative
 from vipe_core.priors.protocols import Aligner, DenseMatcher, Match, Refiner, SparseTracker
 from vipe_core.slam.adjustment import SETTLE, Step
 from vipe_core.slam.consensus import MAJORITY, consensus_pose
@@ -22,7 +22,7 @@ from vipe_core.slam.graph import sharpen
 from vipe_core.slam.mapping import ShotMap
 from vipe_core.slam.recurrent.posing import FramePoser, Unposed
 from vipe_core.slam.recurrent.settings import RefinementSettings
-from vipe_core.slam.reprojection import Induced, Reprojector, relative_pose
+from vipe_core.slam.reprojection import Induced, Reprojector
 from vipe_core.slam.rotation import Link, RotationFitter
 from vipe_core.slam.segmentation import UNKNOWN, carried
 from vipe_core.slam.selection import Report
@@ -287,8 +287,8 @@ class _ShotInfill:
 
     def _induced(self, k: int, cam_from_world: Array) -> Induced:
         """Where a pose sees the cells of keyframe `k`."""
-        relative = relative_pose(cam_from_world, self._keyframes.pose(k))
-        return self._reprojector.induced(self._keyframes.intrinsics, relative, self._keyframes.depth(k))
+        frame_from_keyframe = relative(cam_from_world, self._keyframes.pose(k))
+        return self._reprojector.induced(self._keyframes.intrinsics, frame_from_keyframe, self._keyframes.depth(k))
 
     def _turned(self, pending: list[_Pending], fitter: RotationFitter) -> NDArray[np.float64]:
         """(B, 4, 4) rotation-only poses of a batch."""

@@ -15,10 +15,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from vipe_core.geometry.arrays import relative
 from vipe_core.slam.consensus import Agreement, agree
 from vipe_core.slam.graph import Graph
 from vipe_core.slam.keyframes import KeyframeMap
-from vipe_core.slam.reprojection import Reprojector, relative_pose
+from vipe_core.slam.reprojection import Reprojector
 from vipe_core.slam.segmentation import MOVING, STATIC, UNKNOWN
 
 Array = NDArray[Any]
@@ -137,12 +138,12 @@ class MotionMasks:
         measured = [j for j in targets if (k, j) in self._graph]
         if not measured:
             return None
-        relative = relative_pose(np.stack([keyframes.pose(j) for j in measured]), keyframes.pose(k))
+        targets_from_source = relative(np.stack([keyframes.pose(j) for j in measured]), keyframes.pose(k))
         matches = [self._graph[k, j] for j in measured]
         return agree(
             self._reprojector,
             keyframes.intrinsics_at(k),
-            relative,
+            targets_from_source,
             matches,
             self.robust_scale_px,
             keyframes.depth(k),

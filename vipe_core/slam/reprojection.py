@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from vipe_core.ba.problem import Grid
 from vipe_core.cameras import CameraModel
 from vipe_core.cameras.projection import project, unproject
-from vipe_core.geometry import se3
+from vipe_core.geometry.arrays import relative
 from vipe_core.slam.keyframes import KeyframeMap
 
 Array = NDArray[Any]
@@ -81,11 +81,11 @@ class Reprojector:
             into: (K,) index parameters of the target camera, where that is another one.
         """
         params = torch.from_numpy(np.asarray(intrinsics, dtype=np.float64))
-        relative = torch.from_numpy(np.asarray(target_from_source, dtype=np.float64))
+        pose = torch.from_numpy(np.asarray(target_from_source, dtype=np.float64))
         depth = torch.from_numpy(np.asarray(inverse_depth, dtype=np.float64))
         px = self._px if cells is None else self._px[torch.from_numpy(np.asarray(cells, dtype=np.int64))]
         rays = unproject(self.model, params, px)
-        points = rays @ relative[..., :3, :3].mT + relative[..., None, :3, 3] * depth[..., None]
+        points = rays @ pose[..., :3, :3].mT + pose[..., None, :3, 3] * depth[..., None]
         target_params = params if into is None else torch.from_numpy(np.asarray(into, dtype=np.float64))
         target_px, valid = project(self.model, target_params, points)
         # The homogeneous scale starts at |ray|; what is left of it is the ratio of the depths.
@@ -106,32 +106,32 @@ class Reprojector:
     def parallax_deg(self, intrinsics: Array, target_from_source: Array, inverse_depth: Array) -> NDArray[np.float64]:
         """(P,) angle at each point between its rays to the two camera centres, degrees."""
         params = torch.from_numpy(np.asarray(intrinsics, dtype=np.float64))
-        relative = np.asarray(target_from_source, dtype=np.float64)
+        pose = np.asarray(target_from_source, dtype=np.float64)
         rays = unproject(self.model, params, self._px).numpy()
         # Both directions in the source frame, scaled by the inverse depth so that infinity stays finite.
-        centre = -relative[:3, :3].T @ relative[:3, 3]
+        centre = -pose[:3, :3].T @ pose[:3, 3]
         other = rays - np.asarray(inverse_depth, dtype=np.float64)[:, None] * centre
         across = np.linalg.norm(np.cross(rays, other), axis=1)
         return np.asarray(np.degrees(np.arctan2(across, (rays * other).sum(axis=1))))
 
     def edge(self, keyframes: KeyframeMap, i: int, j: int) -> Induced:
         """The cells of keyframe `i` in keyframe `j`."""
-        relative = relative_pose(keyframes.pose(j), keyframes.pose(i))
+        target_from_source = relative(keyframes.pose(j), keyframes.pose(i))
         into = keyframes.intrinsics_at(j)
-        return self.induced(keyframes.intrinsics_at(i), relative, keyframes.depth(i), into=into)
+        return self.induced(keyframes.intrinsics_at(i), target_from_source, keyframes.depth(i), into=into)
 
     def fan(self, keyframes: KeyframeMap, sources: Sequence[int], targets: Sequence[int], subsample: int) -> Fan:
         """Displacement and overlap of many pairs, on every `subsample`-th row and column of the grid."""
         rows = np.arange(subsample // 2, self.grid.height, subsample)
         columns = np.arange(subsample // 2, self.grid.width, subsample)
         cells = (rows[:, None] * self.grid.width + columns).reshape(-1)
-        relative = relative_pose(
+        target_from_source = relative(
             np.stack([keyframes.pose(j) for j in targets]), np.stack([keyframes.pose(i) for i in sources])
         )
         depth = np.stack([keyframes.depth(i)[cells] for i in sources])
         count, total = np.empty(len(depth)), np.empty(len(depth))
         for rows_of, seen_from, seen_in in _by_cameras(keyframes, sources, targets):
-            induced = self.induced(seen_from, relative[rows_of], depth[rows_of], cells, seen_in)
+            induced = self.induced(seen_from, target_from_source[rows_of], depth[rows_of], cells, seen_in)
             count[rows_of] = induced.visible.sum(axis=-1)
             total[rows_of] = np.where(induced.visible, induced.displacement_px, 0).sum(axis=-1, dtype=np.float64)
         motion = np.where(count > 0, total / np.maximum(count, 1), np.inf)
@@ -150,13 +150,6 @@ def _by_cameras(
     for both in np.unique(pair).tolist():
         rows = np.flatnonzero(pair == both)
         yield rows, keyframes.intrinsics_of(both // views), keyframes.intrinsics_of(both % views)
-
-
-def relative_pose(target_from_world: Array, source_from_world: Array) -> NDArray[np.float64]:
-    """(..., 4, 4) target_from_source."""
-    return np.asarray(
-        se3.relative(torch.from_numpy(np.asarray(target_from_world)), torch.from_numpy(np.asarray(source_from_world)))
-    )
 
 
 def splat_inverse_depth(reprojector: Reprojector, keyframes: KeyframeMap, i: int, j: int) -> NDArray[np.float32]:

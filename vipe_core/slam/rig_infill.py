@@ -13,14 +13,14 @@ import torch
 from numpy.typing import NDArray
 
 from vipe_core.ba.problem import Edges, Free, Problem, Rig, State
-from vipe_core.geometry.arrays import interpolate_trajectory
+from vipe_core.geometry.arrays import interpolate_trajectory, relative
 from vipe_core.priors.protocols import Aligner, DenseMatcher, Match, SparseTracker
 from vipe_core.slam.adjustment import SETTLE, Step
 from vipe_core.slam.consensus import MAJORITY
 from vipe_core.slam.graph import sharpen
 from vipe_core.slam.infill import MIN_INLIERS, SCHEDULE, Trajectory, blank_trajectory, judge
 from vipe_core.slam.mapping import ShotMap
-from vipe_core.slam.reprojection import Induced, Reprojector, relative_pose
+from vipe_core.slam.reprojection import Induced, Reprojector
 from vipe_core.slam.rig_consensus import Sighting, consensus_rig_pose
 from vipe_core.slam.rig_frames import EncodedRig
 from vipe_core.slam.segmentation import carried
@@ -212,8 +212,8 @@ class _RigInfill:
 
     def _induced(self, k: int, cam_from_world: Array) -> Induced:
         """Where a pose of the same view sees the cells of keyframe `k`."""
-        relative = relative_pose(cam_from_world, self._keyframes.pose(k))
-        return self._reprojector.induced(self._keyframes.intrinsics_at(k), relative, self._keyframes.depth(k))
+        seen_from_keyframe = relative(cam_from_world, self._keyframes.pose(k))
+        return self._reprojector.induced(self._keyframes.intrinsics_at(k), seen_from_keyframe, self._keyframes.depth(k))
 
     def _adjusted(self, pending: list[_Pending], schedule: Sequence[Step]) -> NDArray[np.float64] | None:
         """(B, 4, 4) rig poses by a motion-only adjustment: keyframes are fixed sources, instants are free targets."""

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vipe_core.ba.problem import Grid
+from vipe_core.statistics import weighted_median
 
 Array = NDArray[Any]
 
@@ -31,7 +32,7 @@ def smooth_inverse_depth(inverse_depth: Array, confidence: Array, grid: Grid) ->
     shape = (grid.height, grid.width)
     value = np.asarray(inverse_depth, dtype=np.float32).reshape(shape)
     weight = np.asarray(confidence, dtype=np.float32).reshape(shape)
-    typical = _weighted_median(value, weight)
+    typical = weighted_median(value.ravel(), weight.ravel()) if weight.any() else float(np.median(value))
     # A whisper of the frame's typical value keeps the quotient defined everywhere.
     result = np.full(shape, typical, dtype=np.float32)
     for sigma in (_COARSE_CELLS, _FINE_CELLS):
@@ -39,12 +40,3 @@ def smooth_inverse_depth(inverse_depth: Array, confidence: Array, grid: Grid) ->
         total = cv2.GaussianBlur(weight * value, (0, 0), sigma, borderType=cv2.BORDER_REFLECT_101)
         result = (total + np.float32(_ENOUGH) * result) / (mass + np.float32(_ENOUGH))
     return np.asarray(result, dtype=np.float32).reshape(-1)
-
-
-def _weighted_median(value: Array, weight: Array) -> float:
-    flat, mass = value.ravel(), weight.ravel()
-    if not mass.sum() > 0:
-        return float(np.median(flat))
-    order = np.argsort(flat, kind="stable")
-    cumulative = np.cumsum(mass[order], dtype=np.float64)
-    return float(flat[order[np.searchsorted(cumulative, 0.5 * cumulative[-1])]])

@@ -26,9 +26,10 @@ from numpy.typing import NDArray
 
 from vipe_core.cameras import Camera
 from vipe_core.cameras.epipolar import RaySlopes, essential_matrix, sampson_distances
+from vipe_core.geometry.arrays import relative
 from vipe_core.slam.graph import Graph
 from vipe_core.slam.keyframes import KeyframeMap
-from vipe_core.slam.reprojection import relative_pose
+from vipe_core.statistics import MAD_TO_SIGMA
 
 logger = logging.getLogger(__name__)
 
@@ -118,7 +119,7 @@ def _pair(keyframes: KeyframeMap, graph: Graph, i: int, j: int, scale_px: float)
     source_px = keyframes.grid.sample_px().numpy()[kept].astype(np.float64)
     target_px = match.target_px[kept].astype(np.float64)
     camera = keyframes.camera
-    start = relative_pose(keyframes.pose(j), keyframes.pose(i))
+    start = relative(keyframes.pose(j), keyframes.pose(i))
     scales = [max(scale * scale_px, 0.5) for scale in _SCALES_PX]
 
     def turned(values: Array) -> Array:
@@ -209,7 +210,7 @@ def _fit(error: Callable[[Array], Array], size: int, scales: list[float]) -> tup
 
 def _estimate(log_s: float, information: Array, residual: Array) -> tuple[float, float]:
     """log s with its prior, and its 1-sigma: the formal one is too small because errors of flow are correlated."""
-    noise = 1.4826 * float(np.median(np.abs(residual)))
+    noise = MAD_TO_SIGMA * float(np.median(np.abs(residual)))
     variance = np.linalg.pinv(information, hermitian=True)[3, 3] * (_INFLATION * max(noise, 0.02)) ** 2
     # What Gauss-Newton found has hardly seen the prior: here it counts.
     share = _PRIOR_SIGMA**2 / (_PRIOR_SIGMA**2 + variance)

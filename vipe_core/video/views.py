@@ -1,4 +1,4 @@
-"""Other ways to look at a frame source: a part of it, its pictures cropped or undistorted, its time reversed.
+"""Other ways to look at a frame source: a part of it, cropped, as another camera sees it, or backwards in time.
 
 Every view decodes what it needs when it is asked: nothing is copied to disk, and memory is bounded.
 """
@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from vipe_core.cameras.pixel_map import PixelMap
 from vipe_core.errors import UnsupportedMedia
 from vipe_core.video.source import Frame, FrameSource, FrameStream, VideoInfo
 
@@ -38,29 +39,16 @@ class Crop:
         return cls((picture[0] - width) // 2, (picture[1] - height) // 2, width, height)
 
 
-@dataclass(frozen=True, slots=True)
-class Distortion:
-    """A pinhole camera with OpenCV's radial and tangential distortion, for pixel indices.
-
-    Attributes:
-        matrix: (fx, fy, cx, cy); kept by the undistorted picture.
-        coefficients: (k1, k2, p1, p2[, k3 ...]).
-    """
-
-    matrix: tuple[float, float, float, float]
-    coefficients: tuple[float, ...]
-
-
 class FrameView:
-    """A part of a frame source, with its pictures undistorted, then cropped.
+    """A part of a frame source, with its pictures seen by another camera, then cropped.
 
     Masks belong to the pictures that are seen: `MaskedView` goes around this one.
 
     Args:
         source: What is looked at.
         stop: Frames from this one on are left out; all are seen if None.
-        undistort: Lens whose distortion is taken out of every picture, at the source's full size.
-        crop: Part of the (undistorted) picture that is seen.
+        seen_by: The camera that sees every picture in place of its own, which has the source's full size.
+        crop: Part of the picture, as that camera has it, that is seen.
         timestamps_s: Times of the frames where the source knows none (images of a dataset), in increasing order.
 
     Raises:
@@ -73,13 +61,15 @@ class FrameView:
         source: FrameSource,
         *,
         stop: int | None = None,
-        undistort: Distortion | None = None,
+        seen_by: PixelMap | None = None,
         crop: Crop | None = None,
         timestamps_s: Sequence[float] | None = None,
     ) -> None:
         info = source.info
         if stop is not None and stop < 1:
             raise ValueError(f"a view needs at least one frame, got stop={stop}")
+        if seen_by is not None:
+            info = dataclasses.replace(info, width=seen_by.target.width, height=seen_by.target.height)
         if crop is not None:
             inside = crop.left >= 0 and crop.top >= 0 and crop.width > 0 and crop.height > 0
             if not inside or crop.left + crop.width > info.width or crop.top + crop.height > info.height:
@@ -90,7 +80,7 @@ class FrameView:
         self._stop = stop
         self._crop = crop
         self._timestamps_s = timestamps_s
-        self._maps = None if undistort is None else _undistortion(undistort, info.width, info.height)
+        self._seen_by = seen_by
         self._info = _shortened(info, stop, timestamps_s, crop)
 
     @property
@@ -100,7 +90,7 @@ class FrameView:
     def frames(self, size: tuple[int, int] | None = None, start: int = 0, stop: int | None = None) -> FrameStream:
         """See `FrameSource.frames`."""
         ends = [end for end in (stop, self._stop) if end is not None]
-        whole = self._crop is None and self._maps is None
+        whole = self._crop is None and self._seen_by is None
         with closing(self._source.frames(size if whole else None, start, min(ends, default=None))) as frames:
             for frame in frames:
                 rgb = frame.rgb if whole else self._picture(frame.rgb, size)
@@ -110,8 +100,8 @@ class FrameView:
     def _picture(self, rgb: NDArray[np.uint8], size: tuple[int, int] | None) -> NDArray[np.uint8]:
         import cv2
 
-        if self._maps is not None:
-            rgb = np.asarray(cv2.remap(rgb, *self._maps, cv2.INTER_LINEAR), dtype=np.uint8)
+        if self._seen_by is not None:
+            rgb = self._seen_by.colours(rgb)
         if self._crop is not None:
             rows = slice(self._crop.top, self._crop.top + self._crop.height)
             rgb = rgb[rows, self._crop.left : self._crop.left + self._crop.width]
@@ -179,14 +169,3 @@ def _shortened(info: VideoInfo, stop: int | None, timestamps_s: Sequence[float] 
         duration_s=duration_s,
         frame_names=info.frame_names[:stop],
     )
-
-
-def _undistortion(lens: Distortion, width: int, height: int) -> tuple[Array, Array]:
-    """Where each pixel of the undistorted picture lies in the source's."""
-    import cv2
-
-    fx, fy, cx, cy = lens.matrix
-    matrix = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], dtype=np.float64)
-    coefficients = np.array(lens.coefficients, dtype=np.float64)
-    map_x, map_y = cv2.initUndistortRectifyMap(matrix, coefficients, np.eye(3), matrix, (width, height), cv2.CV_32FC1)
-    return map_x, map_y

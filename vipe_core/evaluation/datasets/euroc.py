@@ -15,6 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vipe_core.cameras import Camera
+from vipe_core.cameras.calibration import coefficients_of
+from vipe_core.cameras.pixel_map import PixelMap
 from vipe_core.errors import ConfigError, FormatError
 from vipe_core.evaluation.datasets.sequence import (
     GroundTruthSequence,
@@ -26,7 +28,6 @@ from vipe_core.evaluation.datasets.sequence import (
 )
 from vipe_core.evaluation.datasets.tum import poses_from_rows, times_from_zero
 from vipe_core.evaluation.truth import GroundTruth
-from vipe_core.video.views import Distortion
 
 Array = NDArray[Any]
 
@@ -58,7 +59,7 @@ def read_euroc(folder: Path, name: str) -> GroundTruthSequence:
     frames = np.flatnonzero(rows >= 0)
     if len(frames) < 2:
         raise FormatError(f"{label(truth_path)}: fewer than two pictures of cam0 lie within its times")
-    camera, lens, body_from_cam = _read_sensor(cam / "sensor.yaml")
+    lens, camera, body_from_cam = _read_sensor(cam / "sensor.yaml")
     xyzw = table[rows[frames]][:, [1, 2, 3, 5, 6, 7, 4]]
     return GroundTruthSequence(
         "euroc",
@@ -67,7 +68,7 @@ def read_euroc(folder: Path, name: str) -> GroundTruthSequence:
             cam / "data",
             tuple(line[1] for line in fields),
             times_from_zero(times_s, listed),
-            undistort=lens,
+            seen_by=PixelMap(lens, camera),
         ),
         GroundTruth(
             world_from_cam=poses_from_rows(xyzw, truth_path) @ body_from_cam,
@@ -81,8 +82,8 @@ def read_euroc(folder: Path, name: str) -> GroundTruthSequence:
     )
 
 
-def _read_sensor(path: Path) -> tuple[Camera, Distortion, Array]:
-    """The undistorted camera, the lens, and body_from_cam."""
+def _read_sensor(path: Path) -> tuple[Camera, Camera, Array]:
+    """The lens, the pinhole that is its undistorted camera, and body_from_cam."""
     try:
         import yaml
     except ImportError as error:
@@ -91,10 +92,11 @@ def _read_sensor(path: Path) -> tuple[Camera, Distortion, Array]:
         sensor = yaml.safe_load(path.read_text(encoding="utf-8"))
         fx, fy, cx, cy = (float(x) for x in sensor["intrinsics"])
         width, height = (int(x) for x in sensor["resolution"])
-        coefficients = tuple(float(x) for x in sensor["distortion_coefficients"])
+        coefficients = coefficients_of("opencv", sensor["distortion_coefficients"], label(path))
         body_from_cam = np.array(sensor["T_BS"]["data"], dtype=np.float64).reshape(4, 4)
         kinds = sensor["camera_model"], sensor["distortion_model"]
-        camera = Camera("pinhole", (fx, fy, cx, cy), width, height)
+        camera = Camera.from_index_params("pinhole", (fx, fy, cx, cy), width, height)
+        lens = Camera.from_index_params("opencv", (fx, fy, cx, cy, *coefficients), width, height)
     except FileNotFoundError as error:
         raise FormatError(f"{label(path)}: no such file; is this a folder of the dataset?") from error
     except (OSError, KeyError, TypeError, ValueError, ConfigError, yaml.YAMLError) as error:
@@ -102,4 +104,4 @@ def _read_sensor(path: Path) -> tuple[Camera, Distortion, Array]:
         raise FormatError(f"{label(path)}: not the description of a camera ({first_line})") from error
     if kinds != ("pinhole", "radial-tangential"):
         raise FormatError(f"{label(path)}: a pinhole with radial-tangential distortion is needed, got {kinds}")
-    return camera, Distortion((fx, fy, cx, cy), coefficients), body_from_cam
+    return lens, camera, body_from_cam

@@ -12,10 +12,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from vipe_core.cameras.pixel_map import PixelMap
 from vipe_core.errors import FormatError
 from vipe_core.evaluation.truth import GroundTruth
 from vipe_core.video import FrameSource, ImageDirectorySource, open_source
-from vipe_core.video.views import Crop, Distortion, FrameView
+from vipe_core.video.views import Crop, FrameView
 
 Array = NDArray[Any]
 
@@ -29,7 +30,7 @@ class Pictures:
         files: Names of the images in order of time; all in order of their names if None.
         timestamps_s: Time of each image, starting at 0; the source's own if None.
         stop: Frames from this one on are left out.
-        undistort: Lens whose distortion is taken out.
+        seen_by: The camera that sees the pictures in place of their own.
         crop: Size (width, height) of the part in the middle of the picture that is kept.
     """
 
@@ -37,7 +38,7 @@ class Pictures:
     files: tuple[str, ...] | None = None
     timestamps_s: tuple[float, ...] | None = None
     stop: int | None = None
-    undistort: Distortion | None = None
+    seen_by: PixelMap | None = None
     crop: tuple[int, int] | None = None
 
     def open(self, name: str | None = None) -> FrameSource:
@@ -49,13 +50,13 @@ class Pictures:
             source = open_source(self.path, name=name)
         else:
             source = ImageDirectorySource(self.path, name=name, files=self.files)
-        if (self.timestamps_s, self.stop, self.undistort, self.crop) == (None, None, None, None):
+        if (self.timestamps_s, self.stop, self.seen_by, self.crop) == (None, None, None, None):
             return source
         size = source.info.width, source.info.height
         return FrameView(
             source,
             stop=self.stop,
-            undistort=self.undistort,
+            seen_by=self.seen_by,
             crop=None if self.crop is None else Crop.centred(*self.crop, size),
             timestamps_s=self.timestamps_s,
         )

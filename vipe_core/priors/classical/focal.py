@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from vipe_core.priors.classical.claims import FocalClaim
 from vipe_core.priors.classical.pairs import FramePair, PairPicker
 from vipe_core.priors.protocols import WorkingFrame
+from vipe_core.statistics import weighted_median, weighted_spread
 
 # A pair of which only this share (or more) of the cells is matched consistently has its full weight.
 _FULL_CONSISTENCY = 0.5
@@ -109,15 +110,15 @@ def _claim(votes: Sequence[FocalVote]) -> FocalClaim | None:
     turned = np.array([v.rotation_focal_px for v in votes])
     turned = turned[np.isfinite(turned)]
     if weights.sum() >= _MIN_TOTAL_WEIGHT * max(1, len(weights)):
-        log_focal, weights = _sorted(np.log([v.focal_px for v in votes]), weights)
+        log_focal = np.log([v.focal_px for v in votes])
         floor = _MIN_LOG_SIGMA
     elif len(turned) >= _MIN_ROTATIONS:
-        log_focal, weights = np.sort(np.log(turned)), np.full(len(turned), 0.5)
+        log_focal, weights = np.log(turned), np.full(len(turned), 0.5)
         floor = _MIN_ROTATION_LOG_SIGMA
     else:
         return None
-    median = _weighted_quantile(log_focal, weights, 0.5)
-    spread = 1.4826 * _weighted_quantile(*_sorted(np.abs(log_focal - median), weights), 0.5)
+    median = weighted_median(log_focal, weights)
+    spread = weighted_spread(log_focal, weights, median)
     # Pairs share their errors (same scene, same kind of motion), so the spread is not divided by their number; with
     # few or light pairs the spread itself is uncertain.
     sigma = max(floor, spread) * math.sqrt(1 + 1 / float(weights.sum()))
@@ -148,16 +149,3 @@ def _rotation_focal(homography: NDArray[np.float64], pp: NDArray[np.float64], wi
     before, here, after = np.square(misfit[best - 1 : best + 2])
     shift = 0.5 * (before - after) / (before - 2 * here + after)
     return float(math.exp(logs[best] + float(np.clip(shift, -0.5, 0.5)) * (logs[1] - logs[0])))
-
-
-def _sorted(
-    values: NDArray[np.float64], weights: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    order = np.argsort(values, kind="stable")
-    return values[order], weights[order]
-
-
-def _weighted_quantile(values: NDArray[np.float64], weights: NDArray[np.float64], q: float) -> float:
-    """Of sorted values, linear between the middles of their weights."""
-    middle = np.cumsum(weights) - 0.5 * weights
-    return float(np.interp(q * weights.sum(), middle, values))

@@ -9,10 +9,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from vipe_core.geometry.arrays import relative
 from vipe_core.slam.keyframes import KeyframeMap
 from vipe_core.slam.proximity import screened
 from vipe_core.slam.recurrent.settings import RefinementSettings
-from vipe_core.slam.reprojection import Reprojector, relative_pose
+from vipe_core.slam.reprojection import Reprojector
 
 Array = NDArray[Any]
 
@@ -67,15 +68,15 @@ def _one_way(
     found = np.empty(len(pairs))
     for start in range(0, len(pairs), _BATCH_PAIRS):
         some = pairs[start : start + _BATCH_PAIRS]
-        relative = relative_pose(
+        target_from_source = relative(
             np.stack([keyframes.pose(j) for _, j in some]), np.stack([keyframes.pose(i) for i, _ in some])
         )
-        shifted = relative.copy()
+        shifted = target_from_source.copy()
         shifted[:, :3, :3] = np.eye(3)
         depth = np.stack([keyframes.depth(i)[cells] for i, _ in some])
         whole, shift = (
             reprojector.induced(keyframes.intrinsics, pose, depth, cells).displacement_px
-            for pose in (relative, shifted)
+            for pose in (target_from_source, shifted)
         )
         mixed = settings.rotation_share * whole + (1 - settings.rotation_share) * shift
         seen = np.isfinite(mixed)
