@@ -28,7 +28,13 @@ PINHOLE: dict[str, Any] = {
     "cy": 240,
 }
 
-focal = st.floats(100, 2000)
+focal = st.floats(300, 2000)
+_MATRIX = """camera_matrix: !!opencv-matrix
+   rows: 3
+   cols: 3
+   dt: d
+   data: [ 50., 0., 32., 0., 50., 24., 0., 0., 1. ]
+"""
 
 
 @given(
@@ -59,12 +65,16 @@ def test_integer_pixel_centres_are_half_a_pixel_off_ours() -> None:
         ({"fx": float("nan")}, "`fx` must be a number"),
         ({"width": 640.5}, "`width` must be a whole number"),
         ({"width": 0}, "is none"),
+        ({"fx": 10**400}, "`fx` must be a number"),
+        ({"width": float("inf")}, "`width` must be a whole number"),
+        ({"fx": 0.78, "fy": 0.8}, "are the focal lengths in pixels"),
         ({"cx": 700}, "principal point lies outside"),
         ({"alpha": 0.5}, "`alpha` belongs to the model mei"),
         ({"distortion": [0.1, 0, 0, 0]}, "has no `distortion`"),
         ({"model": "opencv", "distortion": [0.1]}, "0, 4, 5, 8 numbers, got 1"),
         ({"model": "opencv_fisheye"}, "has 4 numbers, got 0"),
         ({"model": "opencv", "distortion": [-0.9, 0, 0, 0]}, "turns round inside of the picture"),
+        ({"model": "opencv_fisheye", "distortion": [-2, 0, 0, 0]}, "turns round inside of the picture"),
         ({"pixel_centre": "corner"}, "`pixel_centre` is half or integer"),
         ({"use": "maybe"}, "`use` is fixed or initial"),
         ({"focal": 3}, "unknown keys focal"),
@@ -141,6 +151,10 @@ def test_models_of_colmap(tmp_path: Path, line: str, model: str, params: tuple[f
         ("1 THIN_PRISM_FISHEYE 640 480 1 2 3 4\n", "THIN_PRISM_FISHEYE is not understood"),
         ("1 PINHOLE 640 480 500\n", "takes 4 parameters, got 1"),
         ("1 PINHOLE 640 480 five 500 320 240\n", "the line of a camera reads"),
+        ('{"a":' * 100_000, "not readable JSON"),
+        ('{"fl_x": 500, "cx": 320, "cy": 240, "w": NaN, "h": 480}', "`w` must be a whole number"),
+        ("%YAML:1.0\n---\nimage_width: .Nan\nimage_height: 48\n" + _MATRIX, "`image_width` must be a whole number"),
+        ("%YAML:1.0\n---\nimage_width: 64\nimage_height: 48\n" + _MATRIX.replace("50.", ".Nan"), "must be finite"),
         ('{"frames": []}', "fl_x, cx, cy, w, h must stand beside the frames"),
     ],
 )

@@ -12,10 +12,14 @@ default, or `initial`.
 from __future__ import annotations
 
 import math
+import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
+import numpy as np
+
+from vipe_core.cameras import distortion
 from vipe_core.cameras.camera import Camera, CameraModel
 from vipe_core.errors import CalibrationMismatch, ConfigError
 
@@ -28,6 +32,10 @@ _KEYS = {"version", "model", "width", "height", "fx", "fy", "cx", "cy", "alpha",
 _SAME_ASPECT = 0.005
 _MAX_ALPHA = 4.0
 _MAX_SIZE = 1 << 16
+# Fields of view that no lens without a bend has: a focal length in millimetres, or in widths of the picture.
+_WIDEST_PINHOLE_DEG = 170.0
+# Half of the field of view of the narrowest lens whose image is a circle within the picture.
+_NARROWEST_CIRCLE_DEG = 60.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,7 +89,7 @@ class Calibration:
         if "distortion" in data and model in ("pinhole", "mei"):
             raise ConfigError(f"{name}: the model {model} has no `distortion`; use opencv or opencv_fisheye")
         coefficients = coefficients_of(model, data.get("distortion", ()), name)
-        size = [_size(data, key, name) for key in ("width", "height")]
+        size = [size_of(data, key, name) for key in ("width", "height")]
         camera = checked_camera(model, (*numbers, *alpha, *coefficients), size, name)
         return cls(camera, _use(data.get("use", "fixed"), name))
 
@@ -150,9 +158,20 @@ def checked_camera(model: CameraModel, params: Sequence[float], size: Sequence[i
     corners = [(-0.5, -0.5), (width - 0.5, -0.5), (-0.5, height - 0.5), (width - 0.5, height - 0.5)]
     if camera.distorted and not camera.has_ray([((width - 1) / 2, (height - 1) / 2)]).all():
         raise ConfigError(f"{name}: the distortion leaves the middle of the picture without a ray")
-    if model == "opencv" and not camera.has_ray(corners).any():
+    if camera.distorted and not camera.has_ray(corners).any() and _ends_early(camera):
         raise ConfigError(f"{name}: the distortion turns round inside of the picture; are its coefficients in order?")
+    if model in ("pinhole", "opencv") and max(camera.fov_x_deg, camera.fov_y_deg) > _WIDEST_PINHOLE_DEG:
+        raise ConfigError(
+            f"{name}: a lens of this kind does not see {max(camera.fov_x_deg, camera.fov_y_deg):.0f} degrees; "
+            "are the focal lengths in pixels?"
+        )
     return camera
+
+
+def _ends_early(lens: Camera) -> bool:
+    """Whether the image ends where that of no such lens does. The circle of a fisheye may lie within the picture."""
+    limit = distortion.limit(lens.model, np.array(lens.params[4:]))
+    return lens.model == "opencv" or limit < math.radians(_NARROWEST_CIRCLE_DEG)
 
 
 def _use(value: Any, name: str) -> Use:
@@ -162,7 +181,9 @@ def _use(value: Any, name: str) -> Use:
 
 
 def is_number(value: Any) -> bool:
-    return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        return False
+    return abs(value) <= sys.float_info.max  # JSON has whole numbers that no float holds
 
 
 def number_of(data: Mapping[str, Any], key: str, name: str) -> float:
@@ -171,8 +192,9 @@ def number_of(data: Mapping[str, Any], key: str, name: str) -> float:
     return float(data[key])
 
 
-def _size(data: Mapping[str, Any], key: str, name: str) -> int:
+def size_of(data: Mapping[str, Any], key: str, name: str) -> int:
+    """A number of pixels, which some write with a decimal point."""
     value = data.get(key)
-    if isinstance(value, bool) or not isinstance(value, int):
+    if not is_number(value) or value != int(value):
         raise ConfigError(f"{name}: `{key}` must be a whole number of pixels, got {value!r}")
-    return value
+    return int(value)

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from vipe_core.cameras.calibration import Calibration, Use, checked_camera, coefficients_of, number_of
+from vipe_core.cameras.calibration import Calibration, Use, checked_camera, coefficients_of, number_of, size_of
 from vipe_core.cameras.camera import CameraModel
 from vipe_core.errors import ConfigError
 
@@ -63,7 +63,7 @@ def _parsed(text: str, name: str) -> Calibration:
     if head.startswith("{"):
         try:
             data = json.loads(text)
-        except ValueError as error:
+        except (ValueError, RecursionError) as error:
             raise ConfigError(f"{name}: not readable JSON; give {_FORMATS}") from error
         return _from_nerfstudio(data, name) if "fl_x" in data or "frames" in data else Calibration.from_json(data, name)
     if head.startswith(("%YAML", "<?xml")):
@@ -125,9 +125,9 @@ def _from_opencv(text: str, name: str) -> Calibration:
     if not fisheye and not any(coefficients):
         model, coefficients = "pinhole", ()
     fx, fy, cx, cy = (float(matrix[place]) for place in ((0, 0), (1, 1), (0, 2), (1, 2)))
-    return Calibration(
-        checked_camera(model, (fx, fy, cx + 0.5, cy + 0.5, *coefficients), [int(side or 0) for side in size], name)
-    )
+    sides = {f"image_{side}": value for side, value in zip(("width", "height"), size, strict=True)}
+    width_height = [size_of(sides, key, name) for key in sides]
+    return Calibration(checked_camera(model, (fx, fy, cx + 0.5, cy + 0.5, *coefficients), width_height, name))
 
 
 def _first(storage: Any, keys: Sequence[str]) -> Any:
@@ -160,4 +160,5 @@ def _from_nerfstudio(data: Mapping[str, Any], name: str) -> Calibration:
         model, coefficients = "pinhole", ()
     fx, cx, cy = (number_of(data, key, name) for key in ("fl_x", "cx", "cy"))
     fy = number_of(data, "fl_y", name) if "fl_y" in data else fx
-    return Calibration(checked_camera(model, (fx, fy, cx, cy, *coefficients), (int(data["w"]), int(data["h"])), name))
+    size = [size_of(data, key, name) for key in ("w", "h")]
+    return Calibration(checked_camera(model, (fx, fy, cx, cy, *coefficients), size, name))
