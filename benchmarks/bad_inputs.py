@@ -22,12 +22,14 @@ from pathlib import Path
 from threading import Thread
 from typing import Any
 
+import cv2
 import numpy as np
 
 from benchmarks.hostile import media
 from services.domain.errors import ServiceError
 from vipe_core.errors import VipeError
 
+_LENS = {"version": 1, "model": "pinhole", "width": 96, "height": 64, "fx": 90, "fy": 90, "cx": 48, "cy": 32}
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "bad-inputs.md"
 
 
@@ -80,7 +82,7 @@ def try_all() -> list[Answer]:
     """Try everything, in the order of the table."""
     with tempfile.TemporaryDirectory(prefix="bad-inputs-") as name:
         bench = _Bench(Path(os.path.realpath(name)))
-        for part in (_media, _images, _options, _lists, _addresses, _downloads, _requests, _archives):
+        for part in (_media, _images, _options, _cameras, _lists, _addresses, _downloads, _requests, _archives):
             part(bench)
         return bench.answers
 
@@ -184,6 +186,50 @@ def _options(bench: _Bench) -> None:
         "options", "a focal length of 0", "invalid_config", lambda: Camera("pinhole", (0.0, 0.0, 1.0, 1.0), 4, 4)
     )
     bench.tried("options", "a limit of 0", "invalid_config", lambda: Limits(max_frames=0))
+
+
+def _cameras(bench: _Bench) -> None:
+    from vipe_core.cameras.calibration import Calibration
+    from vipe_core.cameras.calibration_files import read_calibration
+    from vipe_core.pipeline.annotator import Annotator
+
+    lens = _LENS
+    bent = {**lens, "model": "opencv", "distortion": [-0.9, 0, 0, 0]}
+    fisheye = {**lens, "model": "opencv_fisheye", "distortion": [-2, 0, 0, 0]}
+    row = "1 PINHOLE 96 64 90 90 48 32\n"
+    files: list[tuple[str, str, str]] = [
+        ("a calibration without a focal length", "camera.json", json.dumps({k: lens[k] for k in lens if k != "fx"})),
+        ("one of version 2", "camera.json", json.dumps({**lens, "version": 2})),
+        ("a key that is not there", "camera.json", json.dumps({**lens, "focal": 90})),
+        ("a focal length that is not a number", "camera.json", json.dumps({**lens, "fx": float("nan")})),
+        ("a negative focal length", "camera.json", json.dumps({**lens, "fx": -90})),
+        ("a focal length in millimetres", "camera.json", json.dumps({**lens, "fx": 3.6, "fy": 3.6})),
+        ("a principal point outside of the picture", "camera.json", json.dumps({**lens, "cx": 300})),
+        ("distortion without a model of it", "camera.json", json.dumps({**lens, "distortion": [0.1, 0, 0, 0]})),
+        ("distortion that folds the picture", "camera.json", json.dumps(bent)),
+        ("a fisheye that folds the picture", "camera.json", json.dumps(fisheye)),
+        ("JSON a hundred thousand deep", "camera.json", '{"a":' * 100_000),
+        ("a list of two cameras", "cameras.txt", row + row),
+        ("a camera of COLMAP that we do not know", "cameras.txt", row.replace("PINHOLE", "THIN_PRISM_FISHEYE")),
+        ("OpenCV's YAML without a matrix", "lens.yml", "%YAML:1.0\n---\nimage_width: 96\nimage_height: 64\n"),
+        ("nerfstudio's file with a camera per frame", "transforms.json", '{"frames": [{"fl_x": 90}]}'),
+        ("prose in place of a calibration", "lens.txt", "about ninety pixels\n"),
+    ]
+    for what, name, content in files:
+        path = bench.file(f"lenses/{name}", content)
+        bench.tried("cameras", what, "invalid_config", lambda path=path: read_calibration(path))  # type: ignore[misc]
+    clip = bench.file("lenses/clip.mp4", media.clip(3))
+    square = Calibration.from_json({**lens, "height": 96})
+    speckles = np.random.default_rng(0).integers(0, 255, (8, 12, 3), dtype=np.uint8)
+    picture = cv2.imencode(".png", cv2.resize(speckles, (96, 64), interpolation=cv2.INTER_NEAREST))[1].tobytes()
+    room = bench.file("lenses/room/0.png", picture).parent
+    panoramas, others = Annotator("panorama"), Annotator()
+    bench.tried("cameras", "a calibration of another aspect", "calibration_mismatch",
+                lambda: others.annotate(clip, calibration=square))  # fmt: skip
+    bench.tried("cameras", "a calibration of a panorama", "invalid_config",
+                lambda: panoramas.annotate(clip, calibration=square))  # fmt: skip
+    bench.tried("cameras", "an ordinary video as a panorama", "media_unsupported",
+                lambda: panoramas.annotate(room))  # fmt: skip
 
 
 def _lists(bench: _Bench) -> None:
@@ -379,6 +425,8 @@ def _requests(bench: _Bench) -> None:
         post("an attribute that is not there", "invalid_request", attributes=["pose", "sound"])
         post("shards of no videos", "invalid_request", shard_max_videos=0)
         post("text in place of a number", "invalid_request", shard_max_videos="3")
+        post("a calibration of a panorama", "invalid_request", preset="panorama", calibration=_LENS)
+        post("a calibration with a camera", "invalid_request", camera="mei", calibration=_LENS)
         post("a known length that is none", "invalid_request", scale_from="height=-1")
         post("a field that is not there", "invalid_request", unknown=1)
         post("a body that is no JSON", "invalid_json", content="{")

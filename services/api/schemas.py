@@ -98,6 +98,8 @@ class JobRequest(ControlFields):
             raise ValueError("output must not be one of the inputs")
         if self.calibration is not None and self.camera is not None:
             raise ValueError("camera and calibration exclude each other: the calibration says which model it is")
+        if self.calibration is not None and offer.camera_of(self.preset) == "equirect":
+            raise ValueError("a panorama has no calibration: its pixels are angles; choose another preset")
         if "\x00" in self.name:
             raise ValueError("name must not hold NUL characters")
         offer.preset_options(self.preset, self.camera, self._options())

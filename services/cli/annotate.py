@@ -116,6 +116,8 @@ def annotate(
             raise typer.BadParameter(str(error), param_hint="--scale-from") from error
     if calibration is not None and camera is not None:
         raise typer.BadParameter("the calibration says which model the camera has", param_hint="--camera")
+    if calibration is not None and rig is not None:
+        raise typer.BadParameter("the file of the rig holds the calibrations of its views", param_hint="--calibration")
     try:
         known = None if calibration is None else read_calibration(calibration)
     except ConfigError as error:

@@ -47,7 +47,11 @@ class TestCreate:
         spec = http.post("/v1/jobs", json=body(calibration={**LENS, "pixel_centre": "integer"})).json()["spec"]
         assert spec["calibration"] == {**LENS, "cx": 340.5, "cy": 240.5, "use": "fixed"}
         assert JobSpec.from_json(spec).config_hash != JobSpec.from_json({**spec, "calibration": None}).config_hash
-        for wrong in ({"calibration": {**LENS, "fx": -1}}, {"calibration": LENS, "camera": "mei"}):
+        for wrong in (
+            {"calibration": {**LENS, "fx": -1}},
+            {"calibration": LENS, "camera": "mei"},
+            {"calibration": LENS, "preset": "panorama"},
+        ):
             assert http.post("/v1/jobs", json=body(**wrong)).status_code == 422
 
     def test_attributes_of_a_request_and_of_the_domain_agree(self, http: httpx.Client) -> None:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from vipe_core.evaluation.synthetic import tiny_clip
-from vipe_core.priors.classical.panoramic import looks_panoramic
+from vipe_core.priors.classical.panoramic import ends_apart, looks_panoramic
 
 
 def test_a_panorama_is_recognised_whatever_the_shape_of_its_pixels() -> None:
@@ -26,6 +26,8 @@ def test_half_a_panorama_and_a_cropped_one_are_not() -> None:
     picture = tiny_clip("sideways", 1, 256, 128, model="equirect").rgb[0]
     assert not looks_panoramic([picture[:, :192]])
     assert not looks_panoramic([picture[20:108]])
+    assert ends_apart([picture[:, :192]])
+    assert not ends_apart([picture])
 
 
 def test_plain_borders_are_no_evidence() -> None:
@@ -34,3 +36,5 @@ def test_plain_borders_are_no_evidence() -> None:
     frame[30:60, 50:120] = np.random.default_rng(0).integers(0, 255, (30, 70, 3))
     assert not looks_panoramic([frame])
     assert not looks_panoramic([])
+    assert not ends_apart([frame])
+    assert not ends_apart([])

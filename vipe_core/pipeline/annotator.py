@@ -31,7 +31,7 @@ from vipe_core.depth.scene import scene_of
 from vipe_core.depth.stream import DenseDepth
 from vipe_core.depth.types import DepthFrame
 from vipe_core.depth.without import NoDepth
-from vipe_core.errors import ConfigError, EngineError, OutOfDeviceMemory, VipeError
+from vipe_core.errors import ConfigError, EngineError, OutOfDeviceMemory, UnsupportedMedia, VipeError
 from vipe_core.pipeline.device import (
     describe_device,
     device_memory_bytes,
@@ -47,7 +47,7 @@ from vipe_core.pipeline.presets import Preset, PresetOptions, resolve
 from vipe_core.pipeline.provenance import engine_version, library_versions
 from vipe_core.pipeline.providers import open_depth, open_masks, open_priors, require_libraries
 from vipe_core.pipeline.scaling import ScaledScene, set_scale
-from vipe_core.priors.classical.panoramic import looks_panoramic
+from vipe_core.priors.classical.panoramic import ends_apart, looks_panoramic
 from vipe_core.priors.protocols import PriorFamily
 from vipe_core.priors.weights import require_all
 from vipe_core.quality import assess
@@ -146,10 +146,12 @@ class Annotator:
             InputError, DecodeError: The input cannot be read, or the masks (MaskMismatch) or the calibration
                 (CalibrationMismatch) are not of this video. Code and message are meant for the user.
             ScaleUnobservable: The video does not show the known length.
-            ConfigError: `scale_from` or the file of the calibration is not understood.
+            ConfigError: `scale_from` or the file of the calibration is not understood, or a panorama has a calibration.
             EngineError: A stage failed, a defect of ours; what went wrong is its `__cause__`. So does the dense stream.
         """
         known = None if scale_from is None else KnownLength.parse(scale_from)
+        if calibration is not None and self.preset.camera == "equirect":
+            raise ConfigError("a panorama has no calibration: its pixels are angles; leave out one of the two")
         source = open_source(video, name=name) if isinstance(video, (str, Path)) else video
         if masks is not None:
             source = MaskedView(source, masks)
@@ -201,13 +203,24 @@ class Annotator:
         )
 
     def _model(self, source: FrameSource) -> str:
-        """The camera model to estimate: that of the preset; where it is left open, panoramas are told apart here."""
-        if self.preset.camera != "auto":
-            return self.preset.camera
+        """The camera model to estimate: that of the preset; where it is left open, panoramas are told apart here.
+
+        Raises:
+            UnsupportedMedia: A panorama is asked for, and the pictures show that they are none.
+        """
+        asked = self.preset.camera
+        if asked not in ("auto", "equirect"):
+            return asked
         if source.info.spherical:
             return "equirect"
         with closing(source.frames(stop=_PICTURES_LOOKED_AT)) as frames:
-            return "equirect" if looks_panoramic([frame.rgb for frame in frames]) else "auto"
+            pictures = [frame.rgb for frame in frames]
+        if asked == "equirect" and ends_apart(pictures):
+            raise UnsupportedMedia(
+                f"{source.info.name}: not a panorama: its left and right borders do not meet; a panorama is 360 "
+                "degrees wide and 180 high, and the cameras pinhole, mei and auto take other videos"
+            )
+        return "equirect" if asked == "equirect" or looks_panoramic(pictures) else "auto"
 
     def _family(self) -> PriorFamily:
         """The priors of one video: metric depth is one of the map where measurements are refined with it."""
