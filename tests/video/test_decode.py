@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from fractions import Fraction
 from itertools import pairwise
 from pathlib import Path
 
@@ -111,13 +112,15 @@ def test_ten_bit_becomes_eight(tmp_path: Path, codec: str, pixel_format: str, op
 
 @pytest.mark.parametrize("clockwise_deg", [0, 90, 180, 270])
 def test_rotation_metadata_makes_the_picture_upright(tmp_path: Path, clockwise_deg: int) -> None:
-    path = write_clip(tmp_path / "phone.mp4", 3, (96, 64))
+    path = write_clip(tmp_path / "phone.mp4", 3, (96, 64), pixel_aspect=Fraction(4, 3))
     set_display_rotation(path, clockwise_deg)
     source = VideoFileSource(path)
     coded = picture(2, 96, 64)
     upright = np.rot90(coded, -clockwise_deg // 90)
     frame = list(source.frames())[2]
     assert source.info.rotation_deg == clockwise_deg
+    # A coded pixel is wider than high; turned by a quarter it is higher than wide.
+    assert source.info.pixel_aspect == pytest.approx(3 / 4 if clockwise_deg % 180 else 4 / 3)
     assert (source.info.height, source.info.width) == upright.shape[:2] == frame.rgb.shape[:2]
     assert np.abs(frame.rgb.astype(float) - upright).mean() < 8
     size = (upright.shape[1] // 2, upright.shape[0] // 2)

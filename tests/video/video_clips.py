@@ -41,6 +41,7 @@ def write_clip(
     pixel_format: str = "yuv420p",
     rate: int = 25,
     pts_ms: Sequence[int] | None = None,
+    pixel_aspect: Fraction | None = None,
     options: dict[str, str] | None = None,
     container_options: dict[str, str] | None = None,
 ) -> Path:
@@ -49,6 +50,8 @@ def write_clip(
         stream = container.add_stream(codec, rate=rate, options=options or {})
         stream.width, stream.height = size
         stream.pix_fmt = pixel_format
+        if pixel_aspect is not None:
+            stream.sample_aspect_ratio = pixel_aspect
         time_base = Fraction(1, 1000) if pts_ms is not None else Fraction(1, rate)
         stream.codec_context.time_base = time_base
         for index in range(num_frames):

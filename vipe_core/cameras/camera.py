@@ -23,6 +23,9 @@ if TYPE_CHECKING:
 
 CameraModel = Literal["pinhole", "mei", "equirect", "opencv", "opencv_fisheye"]
 
+# Pixels this near to square, on a logarithmic scale, are taken for square ones: calibrated cameras are that far off.
+SQUARE = 0.02
+
 # How compiled code tells the models apart.
 MODEL_CODE: dict[CameraModel, int] = {"pinhole": 0, "mei": 1, "equirect": 2, "opencv": 3, "opencv_fisheye": 4}
 
@@ -69,6 +72,15 @@ class Camera:
     def focal_px(self) -> float:
         """Horizontal focal length in pixels; NaN for `equirect`."""
         return self.params[0] if self.params else math.nan
+
+    @property
+    def pixel_aspect(self) -> float:
+        """Width of a pixel over its height, as the two focal lengths tell; exactly 1 where it is nearly square, and for
+        `equirect`, whose pixels are angles."""
+        if not self.params:
+            return 1.0
+        aspect = self.params[1] / self.params[0]
+        return aspect if abs(math.log(aspect)) > SQUARE else 1.0
 
     @property
     def fov_x_deg(self) -> float:

@@ -220,7 +220,10 @@ def _write_dense(annotation: Annotation, paths: dict[str, Path], progress: Calla
         "kind": KindZipWriter,
     }
     with ExitStack() as stack:
-        rgb = stack.enter_context(VideoWriter(paths["rgb"], annotation.fps)) if "rgb" in paths else None
+        rgb: VideoWriter | None = None
+        if "rgb" in paths:
+            writer = VideoWriter(paths["rgb"], annotation.fps, pixel_aspect=annotation.camera.pixel_aspect)
+            rgb = stack.enter_context(writer)
         zips = {key: stack.enter_context(opened(paths[key])) for key, opened in writers.items() if key in paths}
         # Closed here, not when an exception's traceback lets go of it: decoder processes are behind it.
         for frame in stack.enter_context(closing(annotation.dense())):

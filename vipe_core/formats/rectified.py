@@ -24,10 +24,10 @@ _WIDEST_DEG = 170.0
 
 
 def rectified(artifacts: Artifacts, fov_x_deg: float | None = None) -> Artifacts:
-    """The same sequence as a pinhole sees it: centred, with square pixels, of the same size and at the same poses.
+    """The same sequence as a pinhole sees it: centred, with square pixels, and at the same poses.
 
-    Straight lines are straight. What the pinhole does not see is left out; what the pictures do not show is black, and
-    without depth.
+    The size is the same, but that oblong pixels make a picture wider or narrower, as players show it. Straight lines
+    are straight. What the pinhole does not see is left out; what the pictures do not show is black, and without depth.
 
     Args:
         fov_x_deg: Horizontal field of view of the pinhole; that of the camera if None, but at most 100 degrees.
@@ -39,7 +39,7 @@ def rectified(artifacts: Artifacts, fov_x_deg: float | None = None) -> Artifacts
     fov_x_deg = min(camera.fov_x_deg, _MAX_OWN_FOV_DEG) if fov_x_deg is None else fov_x_deg
     if not 0 < fov_x_deg < _WIDEST_DEG:
         raise ConfigError(f"a pinhole has a field of view of 0 to {_WIDEST_DEG:g} degrees, not {fov_x_deg:g}")
-    pinhole = Camera.pinhole_from_fov(fov_x_deg, camera.width, camera.height)
+    pinhole = Camera.pinhole_from_fov(fov_x_deg, max(1, round(camera.width * camera.pixel_aspect)), camera.height)
     return replace(
         artifacts,
         camera=pinhole,

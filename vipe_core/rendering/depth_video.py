@@ -31,7 +31,8 @@ def export_depth_video(artifacts: Artifacts, out: str | Path, *, beside_rgb: boo
     colours = DepthColours.of(artifacts)
     with ExitStack() as stack:
         frames = stack.enter_context(closing(read_frames(artifacts)))
-        writer = stack.enter_context(VideoWriter(out, frame_rate(artifacts)))
+        aspect = artifacts.camera.pixel_aspect
+        writer = stack.enter_context(VideoWriter(out, frame_rate(artifacts), pixel_aspect=aspect))
         for frame in frames:
             painted = colours.paint(frame.depth, kind=frame.kind, moving=frame.moving)
             writer.write(np.hstack([frame.rgb, painted]) if beside_rgb else painted)

@@ -20,6 +20,7 @@ from vipe_core.cameras.cube import CubeFaces
 from vipe_core.geometry.arrays import inverse
 from vipe_core.priors.protocols import PriorFamily
 from vipe_core.slam.infill import Trajectory
+from vipe_core.slam.panorama_shots import find_shots, one_after_the_other, report_of_shot
 from vipe_core.slam.rig_system import RigCameras, RigSlam, RigSlamResult
 from vipe_core.slam.selection import Report
 from vipe_core.slam.settings import SlamSettings
@@ -27,6 +28,7 @@ from vipe_core.slam.system import SlamResult
 from vipe_core.slam.working import WorkingSize
 from vipe_core.video.faces import FaceSource
 from vipe_core.video.source import FrameSource
+from vipe_core.video.views import FrameView
 
 Array = NDArray[Any]
 
@@ -98,10 +100,11 @@ class FaceBlender:
 
 
 class PanoramaSlam:
-    """The stage for panoramas; reusable for any number of videos, one at a time."""
+    """The stage for panoramas; reusable for any number of videos, one at a time. Shots are worked on one by one."""
 
     def __init__(self, priors: PriorFamily, settings: SlamSettings, device: torch.device) -> None:
         self._rig = RigSlam(priors, settings, device)
+        self._matcher = priors.matcher
         self._area_px = round(_AREA * settings.working_area_px)
 
     def run(self, source: FrameSource, report: Report) -> SlamResult:
@@ -116,6 +119,16 @@ class PanoramaSlam:
             InputError, DecodeError: From the source; EmptyMedia when it holds no frame.
         """
         faces = CubeFaces.for_panorama(source.info.width, self._area_px)
+        shots = find_shots(source, faces.size, self._matcher, report)
+        if len(shots) == 1:
+            return self._shot(source, faces, report)
+        results = [
+            self._shot(FrameView(source, start=start, stop=stop), faces, report_of_shot(report, shots, number))
+            for number, (start, stop) in enumerate(shots)
+        ]
+        return one_after_the_other(results)
+
+    def _shot(self, source: FrameSource, faces: CubeFaces, report: Report) -> SlamResult:
         cameras = RigCameras(
             cam_from_rig=inverse(faces.panorama_from_face),
             cameras=(faces.camera,) * len(faces.panorama_from_face),

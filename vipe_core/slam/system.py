@@ -139,7 +139,7 @@ class Slam:
         refiner = self._priors.refiner
         offset_px = None if refiner is None else refiner.offset_px
         info = source.info
-        aspect = info.pixel_aspect if known is None else known.camera.params[1] / known.camera.params[0]
+        aspect = info.pixel_aspect if known is None else known.camera.pixel_aspect
         size = working_size(info.width, info.height, settings.working_area_px, offset_px=offset_px, pixel_aspect=aspect)
         frames = EncodedFrames(source, size, self._priors.matcher, settings.frame_cache_bytes)
         decide = self._lean

@@ -9,12 +9,11 @@ import cv2
 import numpy as np
 
 from vipe_core.ba.problem import Grid
+from vipe_core.cameras.camera import SQUARE
 from vipe_core.priors.protocols import WorkingFrame
 from vipe_core.video.source import Frame
 
 _MIN_CELLS = 4
-# Pixels this near to square, on a logarithmic scale, are taken for square ones: calibrated cameras are that far off.
-_SQUARE = 0.02
 # Rows and columns at the border without a brighter pixel are a bar, not a picture: black is 16 in broadcast levels, and
 # an encoder's ringing adds a few.
 _BAR_LEVEL = 24
@@ -64,7 +63,7 @@ def working_size(
     Args:
         pixel_aspect: Width of a pixel over its height.
     """
-    if abs(math.log(pixel_aspect)) > _SQUARE:
+    if abs(math.log(pixel_aspect)) > SQUARE:
         width, height = round(width * min(1.0, pixel_aspect)), round(height / max(1.0, pixel_aspect))
     scale = min(1.0, math.sqrt(area_px / (width * height)))
 

@@ -18,6 +18,8 @@ from numpy.typing import NDArray
 DEFAULT_CRF = 20
 # Rates such as 30000/1001 are exact with this denominator.
 _MAX_FPS_DENOMINATOR = 1001
+# H.264 holds larger ones, but those of broadcasting (64:45 and the like) and any that matters fit in.
+_MAX_ASPECT_DENOMINATOR = 255
 
 
 class VideoWriter:
@@ -32,6 +34,7 @@ class VideoWriter:
     Args:
         path: Final path.
         fps: Frames per second.
+        pixel_aspect: Width of a pixel over its height, which players stretch the picture by.
         crf: x264 quality, smaller is better (0-51).
         preset: x264 speed preset.
         threads: x264 threads; part of what determines the bytes.
@@ -42,6 +45,7 @@ class VideoWriter:
         path: str | Path,
         fps: float | Fraction,
         *,
+        pixel_aspect: float = 1.0,
         crf: int = DEFAULT_CRF,
         preset: str = "veryfast",
         threads: int = 1,
@@ -53,6 +57,7 @@ class VideoWriter:
         # Among multiples of 1 / 1001 there is nothing for a picture an hour: below one per second, round the period.
         exact = Fraction(fps)
         self._rate = exact.limit_denominator(_MAX_FPS_DENOMINATOR) if exact >= 1 else 1 / round(1 / exact, 3)
+        self._pixel_aspect = Fraction(pixel_aspect).limit_denominator(_MAX_ASPECT_DENOMINATOR)
         self._options = {"crf": str(crf), "preset": preset}
         self._threads = threads
         self._container: OutputContainer | None = None
@@ -131,6 +136,8 @@ class VideoWriter:
         context = stream.codec_context
         context.thread_count = self._threads
         context.time_base = 1 / self._rate
+        if self._pixel_aspect != 1:
+            stream.sample_aspect_ratio = self._pixel_aspect
         context.colorspace = int(Colorspace.SMPTE170M)
         context.color_range = int(ColorRange.MPEG)
         self._stream = stream

@@ -46,28 +46,30 @@ class FrameView:
 
     Args:
         source: What is looked at.
-        stop: Frames from this one on are left out; all are seen if None.
+        start: Frames before this one are left out, and it is number 0; all keep their times.
+        stop: Frames from this one on, in the numbers of the source, are left out; all are seen if None.
         seen_by: The camera that sees every picture in place of its own, which has the source's full size.
         crop: Part of the picture, as that camera has it, that is seen.
-        timestamps_s: Times of the frames where the source knows none (images of a dataset), in increasing order.
+        timestamps_s: Times of the frames seen where the source knows none (images of a dataset), in increasing order.
 
     Raises:
         UnsupportedMedia: The crop reaches beyond the picture.
-        ValueError: `stop` is not positive.
+        ValueError: `stop` is not behind `start`.
     """
 
     def __init__(
         self,
         source: FrameSource,
         *,
+        start: int = 0,
         stop: int | None = None,
         seen_by: PixelMap | None = None,
         crop: Crop | None = None,
         timestamps_s: Sequence[float] | None = None,
     ) -> None:
         info = source.info
-        if stop is not None and stop < 1:
-            raise ValueError(f"a view needs at least one frame, got stop={stop}")
+        if start < 0 or (stop is not None and stop <= start):
+            raise ValueError(f"a view needs at least one frame, got [{start}, {stop})")
         if seen_by is not None:
             info = dataclasses.replace(info, width=seen_by.target.width, height=seen_by.target.height)
         if crop is not None:
@@ -77,11 +79,12 @@ class FrameView:
                     f"{info.name}: a crop of {crop.width}x{crop.height} does not fit into {info.width}x{info.height}"
                 )
         self._source = source
+        self._start = start
         self._stop = stop
         self._crop = crop
         self._timestamps_s = timestamps_s
         self._seen_by = seen_by
-        self._info = _shortened(info, stop, timestamps_s, crop)
+        self._info = _shortened(info, start, stop, timestamps_s, crop)
 
     @property
     def info(self) -> VideoInfo:
@@ -89,13 +92,15 @@ class FrameView:
 
     def frames(self, size: tuple[int, int] | None = None, start: int = 0, stop: int | None = None) -> FrameStream:
         """See `FrameSource.frames`."""
-        ends = [end for end in (stop, self._stop) if end is not None]
+        ends = [end for end in (None if stop is None else self._start + stop, self._stop) if end is not None]
         whole = self._crop is None and self._seen_by is None
-        with closing(self._source.frames(size if whole else None, start, min(ends, default=None))) as frames:
+        first, last = self._start + start, min(ends, default=None)
+        with closing(self._source.frames(size if whole else None, first, last)) as frames:
             for frame in frames:
+                index = frame.index - self._start
                 rgb = frame.rgb if whole else self._picture(frame.rgb, size)
-                time_s = frame.timestamp_s if self._timestamps_s is None else self._timestamps_s[frame.index]
-                yield Frame(frame.index, float(time_s), rgb)
+                time_s = frame.timestamp_s if self._timestamps_s is None else self._timestamps_s[index]
+                yield Frame(index, float(time_s), rgb, frame.masked if whole else None)
 
     def _picture(self, rgb: NDArray[np.uint8], size: tuple[int, int] | None) -> NDArray[np.uint8]:
         import cv2
@@ -150,11 +155,14 @@ class ReversedView:
             end = begin
 
 
-def _shortened(info: VideoInfo, stop: int | None, timestamps_s: Sequence[float] | None, crop: Crop | None) -> VideoInfo:
+def _shortened(
+    info: VideoInfo, start: int, stop: int | None, timestamps_s: Sequence[float] | None, crop: Crop | None
+) -> VideoInfo:
     count, fps, duration_s = info.num_frames_hint, info.fps, info.duration_s
-    if stop is not None and count is not None and stop < count:
-        duration_s = None if duration_s is None else duration_s * stop / count
-        count = stop
+    if count is not None and (start or (stop is not None and stop < count)):
+        seen = max(0, min(count, count if stop is None else stop) - start)
+        duration_s = None if duration_s is None else duration_s * seen / count
+        count = seen
     if timestamps_s is not None and len(timestamps_s) > 1:
         span_s = float(timestamps_s[-1]) - float(timestamps_s[0])
         fps = (len(timestamps_s) - 1) / span_s if span_s > 0 else fps
@@ -167,5 +175,5 @@ def _shortened(info: VideoInfo, stop: int | None, timestamps_s: Sequence[float] 
         num_frames_hint=count,
         fps=fps,
         duration_s=duration_s,
-        frame_names=info.frame_names[:stop],
+        frame_names=info.frame_names[start:stop],
     )
