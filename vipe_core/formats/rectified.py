@@ -23,6 +23,18 @@ _MAX_OWN_FOV_DEG = 100.0
 _WIDEST_DEG = 170.0
 
 
+def pinhole_for(camera: Camera, fov_x_deg: float | None = None) -> Camera:
+    """The centred pinhole with square pixels that shows the pictures of a camera; arguments as `rectified`.
+
+    Raises:
+        ConfigError: No pinhole has this field of view.
+    """
+    fov_x_deg = min(camera.fov_x_deg, _MAX_OWN_FOV_DEG) if fov_x_deg is None else fov_x_deg
+    if not 0 < fov_x_deg < _WIDEST_DEG:
+        raise ConfigError(f"a pinhole has a field of view of 0 to {_WIDEST_DEG:g} degrees, not {fov_x_deg:g}")
+    return Camera.pinhole_from_fov(fov_x_deg, max(1, round(camera.width * camera.pixel_aspect)), camera.height)
+
+
 def rectified(artifacts: Artifacts, fov_x_deg: float | None = None) -> Artifacts:
     """The same sequence as a pinhole sees it: centred, with square pixels, and at the same poses.
 
@@ -36,10 +48,7 @@ def rectified(artifacts: Artifacts, fov_x_deg: float | None = None) -> Artifacts
         ConfigError: No pinhole has this field of view.
     """
     camera = artifacts.camera
-    fov_x_deg = min(camera.fov_x_deg, _MAX_OWN_FOV_DEG) if fov_x_deg is None else fov_x_deg
-    if not 0 < fov_x_deg < _WIDEST_DEG:
-        raise ConfigError(f"a pinhole has a field of view of 0 to {_WIDEST_DEG:g} degrees, not {fov_x_deg:g}")
-    pinhole = Camera.pinhole_from_fov(fov_x_deg, max(1, round(camera.width * camera.pixel_aspect)), camera.height)
+    pinhole = pinhole_for(camera, fov_x_deg)
     return replace(
         artifacts,
         camera=pinhole,
