@@ -26,6 +26,8 @@ _PINHOLE_ANGLE_DEG = 55.0
 # the corners is not worth more.
 _LARGEST = 2.0
 _GRID = 49
+# Most bent of the unified models, and how near the end of its own picture the lens may see.
+_MAX_ALPHA, _WITHIN = 4.0, 0.95
 
 
 @dataclass(frozen=True)
@@ -120,6 +122,9 @@ def _nearest_unified(lens: Camera, angle: Array) -> tuple[float, float]:
     px, seen = lens.project(np.stack((np.sin(at), np.zeros_like(at), np.cos(at)), axis=-1))
     radius, at = (px[seen, 0] - cx) / fx, at[seen]
     design = np.stack((np.sin(at), -radius), axis=-1)
-    alpha = float(np.clip(np.linalg.lstsq(design, radius * np.cos(at), rcond=None)[0][1], 0.0, 1.0))
+    # A unified picture with alpha > 1 ends where the cosine is -1 / alpha.
+    outermost = math.cos(at[-1])
+    most = _MAX_ALPHA if outermost >= 0 else min(_MAX_ALPHA, -_WITHIN / outermost)
+    alpha = float(np.clip(np.linalg.lstsq(design, radius * np.cos(at), rcond=None)[0][1], 0.0, most))
     sine = np.sin(at)
     return float((radius * (np.cos(at) + alpha) * sine).sum() / (sine * sine).sum()), alpha

@@ -253,7 +253,7 @@ class Annotator:
             return Slam(priors, self.preset.slam, self.device, budget.fit)
         if priors.refiner is not None:
             raise ConfigError(f"the preset {self.preset.name} does not annotate panoramas; panorama and classical do")
-        return PanoramaSlam(priors, self.preset.slam, self.device)
+        return PanoramaSlam(self._priors, self.preset.slam, self.device)
 
     def _provenance(
         self, source: FrameSource, scaled: ScaledScene, given: Calibration | None = None, *, lean: bool = False

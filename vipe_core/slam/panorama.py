@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -100,11 +100,15 @@ class FaceBlender:
 
 
 class PanoramaSlam:
-    """The stage for panoramas; reusable for any number of videos, one at a time. Shots are worked on one by one."""
+    """The stage for panoramas; reusable for any number of videos, one at a time. Shots are worked on one by one.
 
-    def __init__(self, priors: PriorFamily, settings: SlamSettings, device: torch.device) -> None:
-        self._rig = RigSlam(priors, settings, device)
-        self._matcher = priors.matcher
+    Args:
+        priors: Makes a new family.
+    """
+
+    def __init__(self, priors: Callable[[], PriorFamily], settings: SlamSettings, device: torch.device) -> None:
+        self._priors = priors
+        self._rig = RigSlam(priors(), settings, device)
         self._area_px = round(_AREA * settings.working_area_px)
 
     def run(self, source: FrameSource, report: Report) -> SlamResult:
@@ -119,7 +123,7 @@ class PanoramaSlam:
             InputError, DecodeError: From the source; EmptyMedia when it holds no frame.
         """
         faces = CubeFaces.for_panorama(source.info.width, self._area_px)
-        shots = find_shots(source, faces.size, self._matcher, report)
+        shots = find_shots(source, self._priors().matcher, report)
         if len(shots) == 1:
             return self._shot(source, faces, report)
         results = [

@@ -22,12 +22,15 @@ from vipe_core.slam.system import SlamResult
 from vipe_core.slam.working import working_frame
 from vipe_core.video.source import FrameSource
 
+# Panoramas are compared at this size: as many cells as a small ordinary picture has.
+_SIZE = (320, 160)
 
-def find_shots(source: FrameSource, side_px: int, matcher: DenseMatcher, report: Report) -> list[tuple[int, int]]:
+
+def find_shots(source: FrameSource, matcher: DenseMatcher, report: Report) -> list[tuple[int, int]]:
     """First frame of each shot and the one behind its last; together they are the whole video.
 
     Args:
-        side_px: Width and height of the pictures that are compared, for which the matcher is used later on.
+        matcher: One of its own: it is not to be used with pictures of another size afterwards.
 
     Raises:
         EmptyMedia: The video holds no frame.
@@ -35,7 +38,7 @@ def find_shots(source: FrameSource, side_px: int, matcher: DenseMatcher, report:
     """
     splitter = ShotSplitter(matcher)
     starts, count = [0], 0
-    with closing(source.frames((side_px, side_px))) as frames:
+    with closing(source.frames(_SIZE)) as frames:
         for frame in frames:
             work = working_frame(frame)
             features = matcher.encode(work)
@@ -56,17 +59,19 @@ def report_of_shot(report: Report, shots: Sequence[tuple[int, int]], number: int
         shots: As `find_shots` gives them.
     """
     (start, _), (_, total), last = shots[number], shots[-1], number == len(shots) - 1
+    tracked = start
 
     def told(stage: str, done: int, of: int | None) -> None:
-        if stage == "track" or (last and stage == "infill"):
+        nonlocal tracked
+        if stage == "track":
+            tracked = max(tracked, start + done)
+        if last and stage == "infill":
             report(stage, start + done, total)
-        elif last and stage != "scan":
+        elif last and stage not in ("scan", "track"):
             report(stage, done, of)
-        elif last:
-            report("scan", total, total)
         else:
-            # Nothing gets on that is counted, but whoever listens may end the run.
-            report("track", start, total)
+            # Whoever listens may end the run, and waits for a sign of life.
+            report("track", tracked, total)
 
     return told
 

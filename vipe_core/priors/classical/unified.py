@@ -24,11 +24,13 @@ from vipe_core.priors.protocols import IntrinsicsEstimate, IntrinsicsInit, Worki
 
 logger = logging.getLogger(__name__)
 
-_ALPHAS = (0.0, 0.2, 0.4, 0.6, 0.8, 1.0)
+# Candidates are even in 1 / (1 + alpha), which the bend of a lens follows: 1 is a pinhole, 1/2 stereographic,
+# 1/3 the f theta of most fisheyes, 1/4 equisolid.
+_STRAIGHTNESS = (1.0, 0.875, 0.75, 0.625, 0.5, 0.375, 0.25)
 _FOVS_DEG = tuple(float(fov) for fov in np.geomspace(40, 220, 14))
 _MAX_PINHOLE_FOV_DEG = 130.0
-# Second round, around the best of the first: alphas to either side, and fields of view by these factors.
-_FINE_ALPHAS = (-0.1, 0.0, 0.1)
+# Second round, around the best of the first: half a step to either side, and fields of view by these factors.
+_FINE_STRAIGHTNESS = (-0.0625, 0.0, 0.0625)
 _FINE_FOVS = (0.92, 0.96, 1.0, 1.04, 1.08)
 # Distance from the epipolar curve from which on it does not matter how far, px.
 _CUT_PX = 1.0
@@ -90,22 +92,22 @@ def sweep(pairs: Sequence[FramePair], width: int, height: int) -> SweepResult | 
         return None
     tried: dict[tuple[float, float], tuple[float, Camera]] = {}
 
-    def judge(fov_deg: float, alpha: float) -> None:
-        camera = _camera(fov_deg, alpha, width, height)
-        if camera is not None and (fov_deg, alpha) not in tried:
-            tried[fov_deg, alpha] = float(np.mean([_cost(camera, pair) for pair in usable])), camera
+    def judge(fov_deg: float, straightness: float) -> None:
+        camera = _camera(fov_deg, 1 / straightness - 1, width, height)
+        if camera is not None and (fov_deg, straightness) not in tried:
+            tried[fov_deg, straightness] = float(np.mean([_cost(camera, pair) for pair in usable])), camera
 
-    for alpha in _ALPHAS:
+    for straightness in _STRAIGHTNESS:
         for fov_deg in _FOVS_DEG:
-            judge(fov_deg, alpha)
-    fov_deg, alpha = min(tried, key=lambda key: tried[key][0])
-    pinhole_fov_deg = min((key for key in tried if key[1] == 0), key=lambda key: tried[key][0])[0]
+            judge(fov_deg, straightness)
+    fov_deg, straightness = min(tried, key=lambda key: tried[key][0])
+    pinhole_fov_deg = min((key for key in tried if key[1] == 1), key=lambda key: tried[key][0])[0]
     for factor in _FINE_FOVS:
-        judge(pinhole_fov_deg * factor, 0.0)
-        for change in _FINE_ALPHAS:
-            judge(fov_deg * factor, max(0.0, alpha + change))
+        judge(pinhole_fov_deg * factor, 1.0)
+        for change in _FINE_STRAIGHTNESS:
+            judge(fov_deg * factor, min(1.0, straightness + change))
     cost, camera = min(tried.values(), key=lambda value: value[0])
-    return SweepResult(camera, cost, min(value[0] for key, value in tried.items() if key[1] == 0))
+    return SweepResult(camera, cost, min(value[0] for key, value in tried.items() if key[1] == 1))
 
 
 def _camera(fov_deg: float, alpha: float, width: int, height: int) -> Camera | None:
