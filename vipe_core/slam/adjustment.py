@@ -34,6 +34,9 @@ _LEAST_SCALE_PX = 0.5
 PROBED_SHARE = 0.25
 """Share of the cells that `Adjuster.probe` takes."""
 
+# A focal length that is probed is hardly held: a zoom lens changes its own tenfold.
+_PROBED_FOCAL_SIGMA = 0.2
+
 _FAILED = (Status.SINGULAR, Status.NON_FINITE)
 
 
@@ -113,6 +116,21 @@ class ExtrinsicPrior:
     cam_from_rig: NDArray[np.float64]
     place_sigma: NDArray[np.float64]
     rotation_sigma: NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class ProbedFocals:
+    """Focal lengths that keyframes would have if each had its own.
+
+    Attributes:
+        logs: (K,) logarithms, beside the map's; (1,) of one for all.
+        sigmas: Their formal 1-sigmas.
+        cost: Mean squared robust residual, px^2.
+    """
+
+    logs: NDArray[np.float64]
+    sigmas: NDArray[np.float64]
+    cost: float
 
 
 class Adjuster:
@@ -323,6 +341,49 @@ class Adjuster:
             return None
         whole = self._pose_problem(keyframes, graph, frames, fixed_poses, edges, free_focal=True, free_depth=True)
         return self.anneal(*_thinned(*whole), schedule)
+
+    def probe_focals(
+        self,
+        keyframes: KeyframeMap,
+        graph: Graph,
+        frames: Sequence[int],
+        schedule: Sequence[Step],
+        *,
+        shared: bool = False,
+    ) -> ProbedFocals | None:
+        """What adjusting `frames` with a focal length for each of them would come to, by a quarter of the cells and by
+        the measurements alone; the map stays.
+
+        Args:
+            shared: One focal length for all of them instead, for comparison.
+
+        Returns:
+            None where nothing could be solved.
+        """
+        edges = graph.among(frames)
+        if not edges:
+            return None
+        problem, state = self._pose_problem(
+            keyframes, graph, frames, frames[:1], edges, free_focal=False, free_depth=True
+        )
+        count, log_focal = len(frames), math.log(float(keyframes.intrinsics[0]))
+        problem = replace(
+            problem,
+            free=replace(problem.free, focal=True),
+            priors=Priors(log_focal=log_focal, log_focal_sigma=_PROBED_FOCAL_SIGMA),
+        )
+        if not shared:
+            # Every keyframe is the only view of a rig of its own place.
+            number = torch.arange(count, device=self.device)
+            problem = replace(problem, rig=Rig(number, number))
+            eye = torch.eye(4, dtype=torch.float64, device=self.device)
+            state = replace(state, intrinsics=state.intrinsics.repeat(count, 1), cam_from_rig=eye.repeat(count, 1, 1))
+        result = self.anneal(*_thinned(problem, state), schedule)
+        if result is None or not result.weight_sum > 0:
+            return None
+        focals = np.atleast_2d(result.state.intrinsics.cpu().numpy())[:, 0]
+        variances = np.array([covariance[0][0] for covariance in result.intrinsics_covariances])
+        return ProbedFocals(np.log(focals) - log_focal, np.sqrt(variances), result.cost / result.weight_sum)
 
     def _pose_problem(
         self,

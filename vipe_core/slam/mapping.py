@@ -153,7 +153,7 @@ class ShotMapper:
             usable = np.stack([masks.reliable(k) for k in range(len(keyframes))])
             labels = np.stack([masks.labels(k) for k in range(len(keyframes))])
         with self._clock("zoom"):
-            zoom = find_zoom(keyframes, graph, scale_px)
+            zoom = find_zoom(keyframes, graph, adjuster, scale_px)
         return ShotMap(
             shot, keyframes, graph, motion, focal_sigma_ratio, found, loops, adjuster, fitter, usable, labels, zoom
         )

@@ -1,15 +1,16 @@
 """Whether the focal length changes within a shot.
 
-The map has one focal length. Each pair of keyframes two apart is fitted once more by itself, without the map, with a
-second focal length that is s times the first:
+The map has one focal length. Two questions tell whether that was right:
 
-    a camera that turns and zooms: what it sees moves by rotation and s alone, to the noise of matching. This needs no
-    parallax, and takes s for what it is where a map would walk towards a flat scene instead;
-    a camera that travels: the epipolar geometry of two pictures with s free. Where it travels along its axis, zoom and
-    motion look alike: s is then unsure, and a prior keeps it at 1.
+    a camera that turns and zooms: pairs of keyframes two apart are fitted by themselves, without the map, by a rotation
+    and a second focal length that is s times the first. Where that explains a pair to the noise of matching, it needs
+    no parallax, and takes s for what it is where a map would walk towards a flat scene instead. The products of s along
+    the shot are the focal length over time;
+    a camera that travels: the whole map is adjusted once more with a focal length for every keyframe. Pairs alone would
+    not do: two pictures whose optical axes meet, as those of a camera that circles around something, leave both focal
+    lengths open (Kahl and Triggs, CVPR 1999). The adjustment is a test, and the map stays as it is.
 
-The products of s along the shot are the focal length over time. Errors of a pair do not add up in one direction; those
-of the lens, which the camera model leaves out, might, and set the least change that is told from none.
+A change must be larger than errors of lenses make one look, and explain what one focal length cannot.
 """
 
 from __future__ import annotations
@@ -24,9 +25,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from vipe_core.cameras import Camera
-from vipe_core.cameras.epipolar import RaySlopes, essential_matrix, sampson_distances
 from vipe_core.geometry.arrays import relative
+from vipe_core.slam.adjustment import Adjuster, Step
 from vipe_core.slam.graph import Graph
 from vipe_core.slam.keyframes import KeyframeMap
 from vipe_core.statistics import MAD_TO_SIGMA
@@ -46,10 +46,18 @@ _SCALES_PX = (8.0, 2.0, 1.0)
 _ITERATIONS = 5
 _TRIES = 4
 _DIFFERENCE = 1e-5
-# Errors of flow are correlated: formal sigmas are too small by about this factor.
+# Errors of flow are correlated: formal sigmas are too small by about this factor. What is wrong with the lens is wrong
+# with all pictures alike, and no part of a ratio.
 _INFLATION = 3.0
 # A rotation explains a pair when the median residual is below this, pixels of a working image that is 640 wide.
 _TURNED_PX = 0.5
+# Share of the pairs that must be explained so for the camera to be one that turns.
+_MOST = 0.5
+# The map is adjusted in stretches of this many keyframes, which share some with the next one.
+_STRETCH, _SHARED = 24, 6
+# A zoom starts the adjustment far from the end, and one that is none ends at once.
+_WIDE = (Step("geman_mcclure", 4.0, 12, 1e-3),)
+_NARROW = (Step("geman_mcclure", 4.0, 12, 1e-3), Step("geman_mcclure", 1.0, 40, 1e-3))
 # Least change of the focal length over a shot, and how many sigmas it must be away from none.
 MIN_RATIO = 1.12
 _MIN_SIGMAS = 4.0
@@ -78,23 +86,60 @@ class Zoom:
 NO_ZOOM = Zoom(1.0, math.nan)
 
 
-def find_zoom(keyframes: KeyframeMap, graph: Graph, scale_px: float) -> Zoom:
+def find_zoom(keyframes: KeyframeMap, graph: Graph, adjuster: Adjuster, scale_px: float) -> Zoom:
     """The change of the focal length over a shot.
 
     Args:
         scale_px: Pixels of the working image per pixel of one that is 640 wide.
     """
-    logs, variances = [0.0], [0.0]
-    for i, j in _chain(len(keyframes), graph):
-        found = _pair(keyframes, graph, i, j, scale_px)
-        if found is not None:
-            logs.append(logs[-1] + found[0])
-            variances.append(variances[-1] + found[1] ** 2)
-            logger.debug("keyframes %d-%d: log zoom %.4f, sigma %.4f", i, j, *found)
+    pairs = list(_chain(len(keyframes), graph))
+    if not pairs:
+        return NO_ZOOM
+    turned = [found for i, j in pairs if (found := _turned(keyframes, graph, i, j, scale_px)) is not None]
+    if len(turned) < _MOST * len(pairs):
+        return _of_travel(keyframes, graph, adjuster)
+    logs = np.cumsum([0.0, *(log_s for log_s, _ in turned)])
+    variances = np.cumsum([0.0, *(sigma**2 for _, sigma in turned)])
+    return _between(logs, variances)
+
+
+def _between(logs: Array, variances: Array) -> Zoom:
+    """From running sums of log s and of their variances."""
     first, last = sorted((int(np.argmin(logs)), int(np.argmax(logs))))
     if first == last:
         return NO_ZOOM
     return Zoom(math.exp(abs(logs[last] - logs[first])), math.sqrt(variances[last] - variances[first]))
+
+
+def _of_travel(keyframes: KeyframeMap, graph: Graph, adjuster: Adjuster) -> Zoom:
+    """By adjustments with a focal length for every keyframe, stretch by stretch."""
+    count = len(keyframes)
+    logs, sigmas = np.zeros(count), np.zeros(count)
+    gains: list[float] = []
+    start = 0
+    while True:
+        frames = list(range(start, min(start + _STRETCH, count)))
+        found = adjuster.probe_focals(keyframes, graph, frames, _WIDE)
+        if found is None:
+            return NO_ZOOM
+        if math.exp(np.ptp(found.logs)) > MIN_RATIO:
+            held = adjuster.probe_focals(keyframes, graph, frames, _NARROW, shared=True)
+            found = adjuster.probe_focals(keyframes, graph, frames, _NARROW) or found
+            gains.append(0.0 if held is None else 1 - found.cost / max(held.cost, 1e-12))
+        # Each stretch has the focal length of its own start for a unit: they agree where they overlap.
+        both = slice(start, start + _SHARED)
+        offset = float(np.median(logs[both] - found.logs[:_SHARED])) if start else 0.0
+        logs[frames], sigmas[frames] = found.logs + offset, found.sigmas
+        if frames[-1] == count - 1:
+            break
+        start += _STRETCH - _SHARED
+    shortest, longest = int(np.argmin(logs)), int(np.argmax(logs))
+    ratio = math.exp(logs[longest] - logs[shortest])
+    sigma = _INFLATION * math.hypot(sigmas[longest], sigmas[shortest])
+    logger.debug("focal lengths of keyframes: %s, gains %s", np.round(np.exp(logs - logs[0]), 3), np.round(gains, 3))
+    if ratio > MIN_RATIO and max(gains, default=0.0) < _MIN_GAIN:
+        return NO_ZOOM
+    return Zoom(ratio, sigma)
 
 
 def _chain(count: int, graph: Graph) -> Iterator[tuple[int, int]]:
@@ -107,8 +152,8 @@ def _chain(count: int, graph: Graph) -> Iterator[tuple[int, int]]:
         at = at + 1 if to is None else to
 
 
-def _pair(keyframes: KeyframeMap, graph: Graph, i: int, j: int, scale_px: float) -> tuple[float, float] | None:
-    """log s between two keyframes and its 1-sigma; None where too little is measured."""
+def _turned(keyframes: KeyframeMap, graph: Graph, i: int, j: int, scale_px: float) -> tuple[float, float] | None:
+    """log s between two keyframes and its 1-sigma; None where no rotation explains them, or little is measured."""
     match = graph[i, j]
     kept = np.flatnonzero((match.weight.max(axis=1) > _MIN_WEIGHT) & keyframes.static(i))
     if len(kept) < _MIN_POINTS:
@@ -122,54 +167,22 @@ def _pair(keyframes: KeyframeMap, graph: Graph, i: int, j: int, scale_px: float)
     start = relative(keyframes.pose(j), keyframes.pose(i))
     scales = [max(scale * scale_px, 0.5) for scale in _SCALES_PX]
 
-    def turned(values: Array) -> Array:
+    def error(values: Array) -> Array:
         rotation = cv2.Rodrigues(values[:3])[0] @ start[:3, :3]
         # The focal length itself is free as well: the map's is that of no frame in particular.
         rays = camera.zoomed(math.exp(values[4])).unproject(source_px)
         px, imaged = camera.zoomed(math.exp(values[3] + values[4])).project(rays @ rotation.T)
         return np.where(imaged[:, None], px - target_px, scales[0])
 
-    values, information, residual = _fit(turned, 5, scales)
-    if np.median(np.linalg.norm(residual, axis=1)) < max(_TURNED_PX * scale_px, 0.25):
-        return _estimate(values[3], information, residual)
-    _, _, held = _fit(_Epipolar(camera, source_px, target_px, start, free=False), 6, scales)
-    values, information, residual = _fit(_Epipolar(camera, source_px, target_px, start, free=True), 6, scales)
-    gain = 1 - _cost(residual, scales[-1]) / max(_cost(held, scales[-1]), 1e-12)
-    logger.debug("%d-%d: %.4f, gain %.3f, %.3f px", i, j, values[3], gain, float(np.median(np.abs(residual))))
-    return _estimate(values[3], information, residual) if gain > _MIN_GAIN else None
+    values, information, residual = _fit(error, 5, scales)
+    if np.median(np.linalg.norm(residual, axis=1)) >= max(_TURNED_PX * scale_px, 0.25):
+        return None
+    return _estimate(values[3], information, residual)
 
 
 def _cost(residual: Array, scale: float) -> float:
     square = np.square(residual / scale).sum(axis=1)
     return float((square / (1 + square)).mean())
-
-
-class _Epipolar:
-    """Residuals of a pair's epipolar geometry by (rotation, log s, direction), the changes from a start."""
-
-    def __init__(self, camera: Camera, source_px: Array, target_px: Array, start: Array, *, free: bool) -> None:
-        self._camera, self._target_px, self._start, self._free = camera, target_px, start, free
-        self._first = RaySlopes.of(camera, source_px)
-        self._seen: dict[float, RaySlopes] = {}
-        norm = float(np.linalg.norm(start[:3, 3]))
-        self._direction = start[:3, 3] / norm if norm > 1e-9 else np.array([0.0, 0.0, 1.0])
-        self._aside = np.linalg.svd(self._direction[None])[2][1:]
-
-    def __call__(self, values: Array) -> Array:
-        pose = np.eye(4)
-        pose[:3, :3] = cv2.Rodrigues(values[:3])[0] @ self._start[:3, :3]
-        pose[:3, 3] = self._direction + values[4:6] @ self._aside
-        pose[:3, 3] /= np.linalg.norm(pose[:3, 3])
-        second = self._second(float(values[3]) if self._free else 0.0)
-        return sampson_distances(essential_matrix(pose), self._first, second)[:, None]
-
-    def _second(self, log_s: float) -> RaySlopes:
-        """Most calls change something else than s."""
-        if log_s not in self._seen:
-            if len(self._seen) > 2:
-                self._seen.clear()
-            self._seen[log_s] = RaySlopes.of(self._camera.zoomed(math.exp(log_s)), self._target_px)
-        return self._seen[log_s]
 
 
 def _fit(error: Callable[[Array], Array], size: int, scales: list[float]) -> tuple[Array, Array, Array]:
