@@ -24,6 +24,7 @@ import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -144,9 +145,9 @@ def judge(
     extent = np.array([_extent_px(chain) * _WIDTH / camera.width for _, chain in edges])
 
     def off_px(changed: Callable[[Chain], Chain]) -> Array:
-        return np.array([bow(changed(chain)) for _, chain in edges]) * extent
+        return np.asarray([bow(changed(chain)) for _, chain in edges] * extent)
 
-    by_plumb = np.array([off_px(lambda chain, k=k: undistorted(chain, size, k)) for k in _TRIED])  # type: ignore[misc]
+    by_plumb = np.array([off_px(partial(undistorted, size=size, k=k)) for k in _TRIED])
     best = int(np.argmin(np.minimum(by_plumb, _BENT_PX).sum(axis=1)))
     line = np.ones(len(edges), np.bool_) if given else by_plumb[best] < _STRAIGHT_PX
     if not line.any():

@@ -15,7 +15,7 @@ import math
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Any, Literal, TypeGuard
 
 import numpy as np
 
@@ -180,7 +180,7 @@ def _use(value: Any, name: str) -> Use:
     return "initial" if value == "initial" else "fixed"
 
 
-def is_number(value: Any) -> bool:
+def is_number(value: Any) -> TypeGuard[float]:
     if isinstance(value, bool) or not isinstance(value, (int, float)):
         return False
     return abs(value) <= sys.float_info.max  # JSON has whole numbers that no float holds
@@ -195,6 +195,6 @@ def number_of(data: Mapping[str, Any], key: str, name: str) -> float:
 def size_of(data: Mapping[str, Any], key: str, name: str) -> int:
     """A number of pixels, which some write with a decimal point."""
     value = data.get(key)
-    if not is_number(value) or value != int(value):
+    if not is_number(value) or not float(value).is_integer():
         raise ConfigError(f"{name}: `{key}` must be a whole number of pixels, got {value!r}")
     return int(value)
