@@ -89,9 +89,12 @@ def one_after_the_other(results: Sequence[SlamResult]) -> SlamResult:
         anchor = poses[-1][-1]
     main = max(results, key=lambda result: len(result.keyframes))
     timings_s: dict[str, float] = {}
+    peak_bytes: dict[str, int] = {}
     for result in results:
         for stage, seconds in result.timings_s.items():
             timings_s[stage] = timings_s.get(stage, 0.0) + seconds
+        for stage, taken in result.peak_bytes.items():
+            peak_bytes[stage] = max(peak_bytes.get(stage, 0), taken)
     names = [field.name for field in dataclasses.fields(Trajectory)]
     trajectories = [result.trajectory for result in results]
     return dataclasses.replace(
@@ -105,4 +108,5 @@ def one_after_the_other(results: Sequence[SlamResult]) -> SlamResult:
         static=np.concatenate([result.static for result in results]),
         map=combine([result.map for result in results]),
         timings_s=timings_s,
+        peak_bytes=peak_bytes,
     )
