@@ -9,6 +9,7 @@ from __future__ import annotations
 import errno
 import logging
 import resource
+import socket
 import threading
 import time
 import traceback
@@ -124,7 +125,9 @@ class Slot:
                     ShardScratch(self._config.scratch_dir, task.lease).discard()
                     return Discarded()
         except _JobFailure as error:
-            return Failed(error.cause.code, str(error), retryable=False, scope="job")
+            # Of many workers, one that lacks something ends the job: whoever reads this must know which.
+            message = f"worker {socket.gethostname()}: {error}"
+            return Failed(error.cause.code, message, retryable=False, scope="job")
         except ObjectMissing as error:
             return Failed(InputUnavailable.code if scope == "video" else error.code, str(error), False, scope)
         except StorageError as error:

@@ -46,6 +46,13 @@ def camera_of(preset: str) -> str:
     return resolve(preset).camera
 
 
+def makes_depth(preset: str) -> bool:
+    """Whether there is any depth in what a preset makes."""
+    from vipe_core.pipeline.presets import resolve
+
+    return resolve(preset).makes_depth
+
+
 def one_of(value: str, offered: tuple[str, ...]) -> str:
     if value not in offered:
         raise ValueError(f"{value!r} is not on offer; on offer: {', '.join(offered)}")

@@ -51,7 +51,8 @@ class JobRequest(ControlFields):
     attributes: list[offer.OfferedAttribute] = Field(
         default_factory=lambda: list(DEFAULT_ATTRIBUTES),
         max_length=8,
-        description="Tars to write; `pose` and `intrinsics` always are, `confidence` only when it is asked for.",
+        description="Tars to write; `pose` and `intrinsics` always are, `confidence` only when it is asked for, and "
+        "`depth` unless the preset makes none.",
     )
     shard_max_videos: int = Field(default=16, ge=1, le=1000, description="Most videos in one shard.")
     shard_max_input_bytes: int = Field(
@@ -103,6 +104,8 @@ class JobRequest(ControlFields):
         if "\x00" in self.name:
             raise ValueError("name must not hold NUL characters")
         offer.preset_options(self.preset, self.camera, self._options())
+        if not offer.makes_depth(self.preset) and "attributes" in self.model_fields_set and self._of_depth():
+            raise ValueError(f"the preset {self.preset} makes no depth; leave {', '.join(self._of_depth())} out")
         if self.calibration is not None and offer.camera_of(self.preset) == "equirect":
             raise ValueError(f"the preset {self.preset} is for 360-degree video, which needs no calibration")
         return self
@@ -114,8 +117,13 @@ class JobRequest(ControlFields):
             "metric_depth": self.metric_depth,
         }
 
+    def _of_depth(self) -> list[str]:
+        return [name for name in self.attributes if name in ("depth", "confidence")]
+
     def to_spec(self) -> JobSpec:
         wanted = {"pose", "intrinsics", *self.attributes}
+        if not offer.makes_depth(self.preset):
+            wanted -= {*self._of_depth()}
         return JobSpec(
             inputs=tuple(self.inputs),
             output=self.output.rstrip("/"),

@@ -119,6 +119,7 @@ class TestCreate:
             ({"detection_interval_s": 0}, "body.detection_interval_s"),
             ({"phrases": ["x" * 65]}, "body.phrases.0"),
             ({"preset": "vipe_fast", "camera": "equirect"}, "body"),
+            ({"preset": "pose_only", "attributes": ["pose", "depth"]}, "body"),
             ({"preset": "panorama", "metric_depth": "hf.depth_pro"}, "body"),
             ({"preset": "panorama", "calibration": LENS}, "body"),
             ({"unknown": 1}, "body.unknown"),
@@ -132,6 +133,10 @@ class TestCreate:
     def test_a_web_server_that_is_not_allowed(self, http: httpx.Client) -> None:
         answer = http.post("/v1/jobs", json=body(inputs=["https://host/clip.mp4"]))
         assert "allowed: none" in assert_problem(answer, 422, "address_refused")["detail"]
+
+    def test_a_preset_without_depth_writes_none(self, http: httpx.Client) -> None:
+        spec = http.post("/v1/jobs", json=body(preset="pose_only")).json()["spec"]
+        assert spec["attributes"] == ["pose", "intrinsics", "rgb", "mask"]
 
     def test_a_preset_that_is_not_offered_names_those_that_are(self, http: httpx.Client) -> None:
         problem = assert_problem(http.post("/v1/jobs", json=body(preset="magic")), 422, "invalid_request")
