@@ -1,7 +1,7 @@
 """DROID-SLAM's own bundle adjustment on one of our problems, from a checkout of it; pinhole, with known intrinsics.
 
-What it runs is a compiled extension for CUDA, `droid_backends.ba`: kernels and a sparse solve on the host. On a GPU it
-is built here (nvcc; Eigen's headers belong in its submodule `thirdparty/lietorch/eigen`). Elsewhere its solver of
+What it runs is a compiled function for CUDA, `ba_cuda`: kernels and a sparse solve on the host. On a GPU that is built
+here (nvcc; Eigen's headers belong in its submodule `thirdparty/lietorch/eigen`). Elsewhere its solver of
 training is what there is, `droid_slam/geom/ba.py`: Python over torch and a dense solve. Of that, its SE(3) type and
 scatter are compiled, and replaced by `transforms.py`; the one line on stereo pairs, which names a GPU, is left out.
 """
@@ -52,12 +52,11 @@ class Droid:
         if device.type == "cuda":
             from torch.utils import cpp_extension
 
-            names = ("droid.cpp", "droid_kernels.cu", "correlation_kernels.cu", "altcorr_kernel.cu")
             eigen = folder / "thirdparty" / "lietorch" / "eigen"
             build: Any = cpp_extension.load
-            sources = [str(folder / "src" / name) for name in names]
+            sources = [str(Path(__file__).with_name("droid_binding.cpp")), str(folder / "src" / "droid_kernels.cu")]
             flags = {"extra_cflags": ["-O3"], "extra_cuda_cflags": ["-O3"]}
-            return Droid("DROID", build("droid_backends", sources, extra_include_paths=[str(eigen)], **flags), None)
+            return Droid("DROID", build("droid_ba", sources, extra_include_paths=[str(eigen)], **flags), None)
         stand_ins: dict[str, dict[str, Any]] = {
             "lietorch": {"SE3": _Batched, "Sim3": type("Sim3", (), {})},
             "torch_scatter": {"scatter_sum": scatter_sum},
