@@ -50,12 +50,20 @@ def rooms(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Artifacts]:
     return {model: write_room(tmp_path_factory.mktemp(model), model) for model in CAMERAS}
 
 
+@pytest.fixture(scope="module")
+def cut_room(tmp_path_factory: pytest.TempPathFactory) -> Artifacts:
+    return write_room(tmp_path_factory.mktemp("cut"), cuts=(5,))
+
+
 def test_the_table_knows_every_format() -> None:
     assert set(EXPORTS) == set(FORMATS)
 
 
-@pytest.mark.parametrize("name", EXPORTS)
-@pytest.mark.parametrize("model", CAMERAS)
+# A rational distortion is an opencv camera to all but the formats that have no place for its last coefficients.
+PAIRS = [(name, model) for model in CAMERAS for name in EXPORTS if model != "rational" or name in FOLDERS[1:3]]
+
+
+@pytest.mark.parametrize(("name", "model"), PAIRS)
 def test_written_or_refused(rooms: dict[str, Artifacts], name: str, model: str, tmp_path: Path) -> None:
     words = REFUSED.get((name, model))
     if words is None:
@@ -71,8 +79,8 @@ def test_written_or_refused(rooms: dict[str, Artifacts], name: str, model: str, 
 
 
 @pytest.mark.parametrize("name", EXPORTS)
-def test_shots_share_no_world(name: str, tmp_path: Path) -> None:
-    room = write_room(tmp_path / "in", cuts=(5,))
+def test_shots_share_no_world(cut_room: Artifacts, name: str, tmp_path: Path) -> None:
+    room = cut_room
     out = tmp_path / "out" / "room"
     if name in WITHOUT_CUTS:
         with pytest.raises(ExportUnsupported, match=r"cuts \(at frame 5\).*--shot"):
@@ -82,8 +90,8 @@ def test_shots_share_no_world(name: str, tmp_path: Path) -> None:
     EXPORTS[name](room, out)
 
 
-def test_a_shot_is_its_frames(tmp_path: Path) -> None:
-    room = write_room(tmp_path, cuts=(5,))
+def test_a_shot_is_its_frames(cut_room: Artifacts) -> None:
+    room = cut_room
     assert room.cuts == (5,)
     first, second = room.shot(1), room.shot(2)
     assert (first.num_frames, second.num_frames, second.cuts) == (5, len(POSES) - 5, ())
@@ -106,13 +114,15 @@ def test_clouds_of_distorted_lenses_are_on_the_surfaces(rooms: dict[str, Artifac
     assert np.quantile(distance_to_surfaces(mesh.vertices.astype(np.float64)), 0.95) < 0.06
 
 
-@pytest.mark.parametrize("model", ["opencv", "rational", "opencv_fisheye"])
+@pytest.mark.parametrize("model", [model for model in CAMERAS if model != "equirect"])
 def test_colmap_and_our_reader_see_the_lens_that_was_given(
     rooms: dict[str, Artifacts], model: str, tmp_path: Path
 ) -> None:
     assert rooms[model].camera == CAMERAS[model]  # to the last bit, though the npz holds float32
     out = export_colmap(rooms[model], tmp_path / "c", text=True, voxel=0.4, step=8)
-    assert read_calibration(out / "sparse/0/cameras.txt").camera == CAMERAS[model]
+    again = read_calibration(out / "sparse/0/cameras.txt").camera
+    assert again.model == CAMERAS[model].model
+    np.testing.assert_allclose(again.params, CAMERAS[model].params, rtol=1e-12)
     out = export_colmap(rooms[model], tmp_path / "b", voxel=0.4, step=8)
     pycolmap = pytest.importorskip("pycolmap", reason="pycolmap is not installed")
     model_read = pycolmap.Reconstruction(str(out / "sparse/0"))

@@ -24,7 +24,7 @@ from vipe_core.pipeline.annotator import Annotator
 OFF_CENTRE = Camera("pinhole", (140.3, 151.7, 92.8, 51.1), 160, 120)
 
 
-def clip_of(camera: Camera, num_frames: int = 12) -> SyntheticClip:
+def clip_of(camera: Camera, num_frames: int = 8) -> SyntheticClip:
     eye = arc((3.0, 2.5, 1.45), 1.9, -75.0, -50.0, num_frames)
     return render_clip(room_scene(), camera, look_at(eye, np.array([3.0, 2.5, 0.7])))
 
@@ -96,6 +96,6 @@ def test_what_does_not_fit_is_refused_before_any_work() -> None:
 
 def test_a_pixel_without_a_ray_has_no_known_distance() -> None:
     lens = Camera("opencv", (100.0, 100.0, 80.0, 60.0, -0.22, 0, 0, 0, 0, 0, 0, 0), 160, 120)
-    clip = clip_of(sample_camera("pinhole", 160, 120), 8)
+    clip = clip_of(sample_camera("pinhole", 160, 120), 3)
     with pytest.raises(ScaleUnobservable, match="the calibration has no ray there"):
         Annotator().annotate(ClipSource(clip.rgb), calibration=Calibration(lens), scale_from="depth=2@0.5,0.5,0")
