@@ -41,6 +41,7 @@ _log = logging.getLogger(__name__)
 _T = TypeVar("_T")
 
 _SQLITE_PATIENCE_MS = 30_000
+_SQLITE_CACHE_KIB = 256
 _WRITE = "vipe_write"
 _SCHEMA = "vipe_schema"
 # PostgreSQL asks for these transactions to be run again: serialization failure, deadlock.
@@ -210,6 +211,8 @@ def _prepare_sqlite(engine: Engine) -> None:
             f"busy_timeout = {_SQLITE_PATIENCE_MS}",
             "journal_mode = WAL",
             "synchronous = NORMAL",
+            # Each connection has a cache of its own, and the system caches the file for all of them.
+            f"cache_size = -{_SQLITE_CACHE_KIB}",
         ):
             cursor.execute(f"PRAGMA {pragma}")
         cursor.close()
