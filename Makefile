@@ -7,7 +7,7 @@ export OMP_WAIT_POLICY ?= passive
 # Ray and matplotlib must not phone home or open windows.
 export RAY_USAGE_STATS_ENABLED := 0
 
-.PHONY: demo test setup lint types unit chaos kernels lock format audit fuzz clean
+.PHONY: demo test test-long setup lint types unit chaos kernels lock format audit fuzz clean
 
 $(VENV)/.runtime: pyproject.toml requirements.lock scripts/setup.sh
 	@scripts/setup.sh
@@ -23,6 +23,9 @@ demo: $(VENV)/.runtime ## run the service on sample videos, or on VIDEO=clip.mp4
 	@$(VENV)/bin/vipectl demo $(if $(VIDEO),"$(VIDEO)")
 
 test: setup lint types unit ## everything that CI runs
+
+test-long: setup ## what takes too long for CI
+	$(VENV)/bin/python -m pytest --numprocesses $(TEST_PROCESSES) --dist worksteal -m long $(PYTEST_ARGS)
 
 lint: setup
 	$(VENV)/bin/ruff format --check .

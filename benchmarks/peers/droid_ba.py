@@ -11,6 +11,9 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
+from importlib.abc import InspectLoader
+from importlib.machinery import ModuleSpec
+from importlib.util import module_from_spec
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -31,6 +34,20 @@ class _Batched(Transforms):
     """One sequence, then its frames or edges."""
 
     batch_dims = 2
+
+
+class _OnAnyDevice(InspectLoader):
+    """A module of theirs, without what ties it to a GPU."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+
+    def is_package(self, fullname: str) -> bool:
+        return False
+
+    def get_source(self, fullname: str) -> str:
+        source = self._path.read_text().replace("Gij.data[:, ii == jj] = torch.as_tensor(", "(")
+        return source.replace('1.0], device="cuda"', "1.0]")
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,14 +83,11 @@ class Droid:
             sys.modules[name] = module = ModuleType(name)
             vars(module).update(members)
         for name in ("projective_ops", "chol", "ba"):
-            path = folder / "droid_slam" / "geom" / f"{name}.py"
-            module = ModuleType(f"geom.{name}")
-            module.__package__ = "geom"
+            loader = _OnAnyDevice(folder / "droid_slam" / "geom" / f"{name}.py")
+            module = module_from_spec(ModuleSpec(f"geom.{name}", loader))
             sys.modules[module.__name__] = module
             setattr(sys.modules["geom"], name, module)
-            source = path.read_text().replace("Gij.data[:, ii == jj] = torch.as_tensor(", "(")
-            source = source.replace('1.0], device="cuda"', "1.0]")
-            exec(compile(source, str(path), "exec"), vars(module))
+            loader.exec_module(module)
         return Droid("DROID (its Python)", None, vars(sys.modules["geom.ba"])["BA"])
 
     def iteration(self, problem: Problem, state: State, damping: float) -> Callable[[], State]:

@@ -272,6 +272,7 @@ def test_kill_9_of_the_agent_loses_and_doubles_nothing(tmp_path: Path) -> None:
     store.close()
 
 
+@pytest.mark.long
 def test_the_real_engine_on_what_users_drop_into_a_folder(tmp_path: Path) -> None:
     """One clip that works beside a cut one, an empty one, a text, one picture and a sound: a row for each."""
     write_assorted_inputs(tmp_path / "inputs")

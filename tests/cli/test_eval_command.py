@@ -41,7 +41,7 @@ def test_a_folder_of_videos_becomes_a_report(vipectl: Run, clip: Path, tmp_path:
     assert (tmp_path / "report" / "report.json").read_bytes() == before
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_ablation_is_one_table(vipectl: Run, clip: Path, tmp_path: Path) -> None:
     done = vipectl("eval", "--videos", clip, "--max-frames", 4, "--ablate", "--no-plots", "-o", "report", timeout_s=600)
     assert done.returncode == 0, done.stderr

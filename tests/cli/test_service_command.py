@@ -81,6 +81,7 @@ def bucket(s3_endpoint: str, monkeypatch: pytest.MonkeyPatch) -> str:
     return name
 
 
+@pytest.mark.long
 def test_a_job_from_s3_to_s3_survives_kill_9(
     bucket: str, service: Service, clip: Path, vipectl: Run, tmp_path: Path, s3_endpoint: str
 ) -> None:

@@ -137,7 +137,7 @@ def test_a_defect_in_one_sequence_does_not_end_the_others(
     assert rows[1].error["message"] == "ZeroDivisionError: an unforeseen case"
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_videos_without_truth_and_two_processes(dataset: Path, finished: Path, tmp_path: Path) -> None:
     """Both kinds of measure in processes of their own; the engine gives the same figures there."""
     measure = dataclasses.replace(MEASURE, consistency=True)

@@ -15,7 +15,7 @@ from vipe_core.geometry import umeyama
 @pytest.mark.timeout(900)
 @pytest.mark.parametrize(
     ("name", "max_ate_share", "max_fov_error_deg"),
-    [("room_handheld", 0.003, 1.5), ("zoom_free_short", 0.005, 1.5)],
+    [pytest.param("room_handheld", 0.003, 1.5, marks=pytest.mark.long), ("zoom_free_short", 0.005, 1.5)],
 )
 def test_poses_and_focal_length(shared_data: Path, name: str, max_ate_share: float, max_fov_error_deg: float) -> None:
     folder = shared_data / "synthetic" / name
