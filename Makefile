@@ -2,7 +2,8 @@
 
 VENV := .venv
 VIDEO ?=
-TEST_PROCESSES ?= 2
+# One more than the cores of a small machine: tests of the service mostly wait for other processes.
+TEST_PROCESSES ?= 3
 export OMP_WAIT_POLICY ?= passive
 # Ray and matplotlib must not phone home or open windows.
 export RAY_USAGE_STATS_ENABLED := 0
