@@ -47,7 +47,7 @@ def solve(problem: Problem, state: State, options: Options | None = None) -> Res
     """
     levenberg.require_solvable(problem, state)
     answer = bundle_adjustment(*_arguments(problem, state, options or Options()))
-    return result_of(Answer(*answer), state)
+    return result_of(answer, state)
 
 
 def _arguments(problem: Problem, state: State, options: Options) -> tuple[Any, ...]:
@@ -165,9 +165,18 @@ _SCHEMA = (
 )
 
 
-@torch.library.custom_op("vipe_core::bundle_adjustment", mutates_args=(), device_types="cpu", schema=_SCHEMA)
+# Not by `torch.library.custom_op`: its first call imports torch's compiler, two seconds for every process.
+_LIBRARY = torch.library.Library("vipe_core", "FRAGMENT")
+_LIBRARY.define(f"bundle_adjustment{_SCHEMA}")
+
+
 def bundle_adjustment(*arguments: Any) -> Answer:
     """`Answer` of the arguments that `_arguments` gives."""
+    return Answer(*torch.ops.vipe_core.bundle_adjustment.default(*arguments))
+
+
+@torch.library.impl(_LIBRARY, "bundle_adjustment", "CPU")
+def _on_host(*arguments: Any) -> Answer:
     return _descended(*_problem(*arguments))
 
 
@@ -175,7 +184,7 @@ def _descended(problem: Problem, state: State, options: Options) -> Answer:
     return answer_of(levenberg.descend(problem, state, options), report_size(problem, state))
 
 
-@bundle_adjustment.register_kernel("cuda")
+@torch.library.impl(_LIBRARY, "bundle_adjustment", "CUDA")
 def _on_gpu(*arguments: Any) -> Answer:
     problem, state, options = _problem(*arguments)
     answer = cuda.solve(problem, state, options) if cuda.takes(problem, state) else None
@@ -189,7 +198,7 @@ def _on_gpu(*arguments: Any) -> Answer:
     return answer._replace(report=torch.cat((answer.report, covariances.flatten())))
 
 
-@bundle_adjustment.register_fake
+@torch.library.register_fake("vipe_core::bundle_adjustment", lib=_LIBRARY)
 def _shapes(*arguments: Any) -> Answer:
     problem, state, _ = _problem(*arguments)
     return Answer(
