@@ -5,6 +5,8 @@ VIDEO ?=
 # One more than the cores of a small machine: tests of the service mostly wait for other processes.
 TEST_PROCESSES ?= 3
 export OMP_WAIT_POLICY ?= passive
+# Container images often set this: every process would compile torch's thousand modules anew, four seconds each.
+unexport PYTHONDONTWRITEBYTECODE
 # Ray and matplotlib must not phone home or open windows.
 export RAY_USAGE_STATS_ENABLED := 0
 

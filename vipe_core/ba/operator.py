@@ -166,7 +166,8 @@ _SCHEMA = (
 
 
 # Not by `torch.library.custom_op`: its first call imports torch's compiler, two seconds for every process.
-_LIBRARY = torch.library.Library("vipe_core", "FRAGMENT")
+_library: Any = torch.library  # has no types
+_LIBRARY = _library.Library("vipe_core", "FRAGMENT")
 _LIBRARY.define(f"bundle_adjustment{_SCHEMA}")
 
 
@@ -175,7 +176,6 @@ def bundle_adjustment(*arguments: Any) -> Answer:
     return Answer(*torch.ops.vipe_core.bundle_adjustment.default(*arguments))
 
 
-@torch.library.impl(_LIBRARY, "bundle_adjustment", "CPU")
 def _on_host(*arguments: Any) -> Answer:
     return _descended(*_problem(*arguments))
 
@@ -184,7 +184,6 @@ def _descended(problem: Problem, state: State, options: Options) -> Answer:
     return answer_of(levenberg.descend(problem, state, options), report_size(problem, state))
 
 
-@torch.library.impl(_LIBRARY, "bundle_adjustment", "CUDA")
 def _on_gpu(*arguments: Any) -> Answer:
     problem, state, options = _problem(*arguments)
     answer = cuda.solve(problem, state, options) if cuda.takes(problem, state) else None
@@ -198,7 +197,6 @@ def _on_gpu(*arguments: Any) -> Answer:
     return answer._replace(report=torch.cat((answer.report, covariances.flatten())))
 
 
-@torch.library.register_fake("vipe_core::bundle_adjustment", lib=_LIBRARY)
 def _shapes(*arguments: Any) -> Answer:
     problem, state, _ = _problem(*arguments)
     return Answer(
@@ -208,3 +206,8 @@ def _shapes(*arguments: Any) -> Answer:
         state.cam_from_world.new_empty(0, 4, 4) if state.cam_from_rig is None else torch.empty_like(state.cam_from_rig),
         state.inverse_depth.new_empty(report_size(problem, state), dtype=torch.float64),
     )
+
+
+_LIBRARY.impl("bundle_adjustment", _on_host, "CPU")
+_LIBRARY.impl("bundle_adjustment", _on_gpu, "CUDA")
+_library.register_fake("vipe_core::bundle_adjustment", _shapes, lib=_LIBRARY)
