@@ -116,18 +116,17 @@ def _scene(frames: int, cells: tuple[int, int], unified: bool, focal: bool, reac
     return problem, State(moved @ truth.cam_from_world, depth * 1.02, truth.intrinsics)
 
 
-def _rig_scene(focal: bool) -> tuple[Problem, State]:
-    """Three cameras on a rig that moves, its extrinsics free under a prior; each with intrinsics of its own, or the
-    focal length of all free."""
-    problem, start = _scene(9, (4, 7), False, focal, 4)
+def _rig_scene(focal: bool, own: bool, unified: bool = False) -> tuple[Problem, State]:
+    """Three cameras on a rig that moves, its extrinsics free under a prior; intrinsics of their own or in common."""
+    problem, start = _scene(9, (4, 7), unified, focal, 4)
     rig = Rig(torch.arange(9) // 3, torch.arange(9) % 3)
     rng = torch.Generator().manual_seed(1)
     cam_from_rig = se3.exp(0.02 * torch.randn(3, 6, generator=rng, dtype=torch.float64))
     rig_from_world = start.cam_from_world[3 * rig.pose_of_frame]
-    intrinsics = start.intrinsics if focal else start.intrinsics * torch.tensor([[1.0], [1.02], [0.99]])
+    intrinsics = start.intrinsics * torch.tensor([[1.0], [1.02], [0.99]]) if own else start.intrinsics
     truth = State(cam_from_rig[rig.view_of_frame] @ rig_from_world, start.inverse_depth, intrinsics, cam_from_rig)
     edges = problem.edges
-    target_px, valid = reproject("pinhole", problem.grid, truth, edges.source, edges.target, rig=rig)
+    target_px, valid = reproject(problem.camera_model, problem.grid, truth, edges.source, edges.target, rig=rig)
     target_px += 0.3 * torch.randn(target_px.shape, generator=rng, dtype=torch.float64)
     free = replace(problem.free, poses=rig.pose_of_frame >= 1, extrinsics=True)
     problem = replace(
@@ -144,15 +143,21 @@ def _rig_scene(focal: bool) -> tuple[Problem, State]:
 
 def _shapes() -> list[tuple[Problem, State, RobustKernel]]:
     """Both cameras, all sets of intrinsics and kernels, odd numbers of cells, a frame with many edges, rigs."""
-    kernels: tuple[RobustKernel, ...] = ("none", "huber", "cauchy", "geman_mcclure", "tukey")
+    kernels: tuple[RobustKernel, ...] = ("none", "huber", "cauchy", "geman_mcclure", "tukey", "truncated")
     shapes = [(4, (5, 13), 2), (6, (9, 15), 3), (9, (16, 20), 4), (3, (1, 7), 2), (27, (3, 5), 26)]
     found: list[tuple[Problem, State, RobustKernel]] = []
     for k, (frames, cells, reach) in enumerate(shapes):
         for unified in (False, True):
             for focal in (False, True):
                 problem, start = _scene(frames, cells, unified, focal, reach)
-                found.append((problem, start, kernels[(k + 2 * unified + focal) % 5]))
-    return [*found, (*_rig_scene(False), "none"), (*_rig_scene(True), "geman_mcclure")]
+                found.append((problem, start, kernels[(k + 2 * unified + focal) % len(kernels)]))
+    rigs: tuple[tuple[bool, bool, bool, RobustKernel], ...] = (
+        (False, True, False, "none"),
+        (True, False, False, "geman_mcclure"),
+        (True, True, False, "truncated"),
+        (True, True, True, "geman_mcclure"),
+    )
+    return [*found, *((*_rig_scene(*kind), robust) for *kind, robust in rigs)]
 
 
 def _same(first: Result, second: Result) -> bool:
@@ -292,7 +297,7 @@ def check_small_solves() -> str:
     """What compute-sanitizer watches: one solve of every kind of kernel, on shapes that fill nothing evenly."""
     shapes = _shapes()
     # Both cameras with and without free intrinsics, a frame with more edges than fit shared memory, rigs.
-    for problem, start, robust in [*shapes[:4], shapes[17], *shapes[-2:]]:
+    for problem, start, robust in [*shapes[:4], shapes[17], *shapes[-4:]]:
         _kernels(*_moved(problem, start, _device()), Options(max_iterations=2, robust=robust, robust_scale_px=4.0))
     return "done"
 

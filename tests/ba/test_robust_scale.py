@@ -14,15 +14,15 @@ from hypothesis import strategies as st
 from vipe_core.ba import Options, Problem, State, largest_residual_px, residual_sigma_px, robust, robust_scale_px, solve
 from vipe_core.ba.problem import RobustKernel
 
-KERNELS = ["huber", "cauchy", "geman_mcclure", "tukey"]
+KERNELS = ["huber", "cauchy", "geman_mcclure", "tukey", "truncated"]
 
 
 @settings(max_examples=80, deadline=None)
-@given(st.sampled_from(KERNELS), st.floats(0.1, 10.0), st.floats(1e-3, 300.0))
-def test_slope_is_the_derivative_of_the_cost(kernel: RobustKernel, scale_px: float, squared: float) -> None:
+@given(st.sampled_from(KERNELS), st.floats(0.1, 10.0), st.floats(0.1, 1.0), st.floats(1e-3, 300.0))
+def test_slope_is_the_derivative_of_the_cost(kernel: RobustKernel, scale_px: float, end: float, squared: float) -> None:
     s = torch.tensor(squared, dtype=torch.float64, requires_grad=True)
-    robust.cost(kernel, scale_px, s).backward()  # type: ignore[no-untyped-call]
-    root = robust.root_slope(kernel, scale_px, s.detach())
+    robust.cost(kernel, scale_px, s, end * scale_px).backward()  # type: ignore[no-untyped-call]
+    root = robust.root_slope(kernel, scale_px, s.detach(), end * scale_px)
     assert s.grad is not None
     assert root is not None
     assert float(root) ** 2 == pytest.approx(float(s.grad), rel=1e-9, abs=1e-12)
@@ -34,6 +34,17 @@ def test_kernels_are_quadratic_at_zero_and_never_fall(kernel: RobustKernel) -> N
     cost = robust.cost(kernel, 3.0, squared)
     assert (cost.diff() >= 0).all()
     assert float(robust.cost(kernel, 3.0, torch.tensor(1e-6, dtype=torch.float64))) == pytest.approx(1e-6)
+
+
+def test_truncation_is_the_surrogate_of_graduated_truncated_least_squares() -> None:
+    """Equation 13 of Yang et al. 2020 with the mu that a scale stands for, and what it is the limit of."""
+    squared = torch.linspace(0, 60, 601, dtype=torch.float64)
+    c, mu = 2.0, 0.7
+    upper = c * math.sqrt((mu + 1) / mu)
+    middle = 2 * c * (squared * mu * (mu + 1)).sqrt() - mu * (c * c + squared)
+    expected = torch.where(squared <= c * c * mu / (mu + 1), squared, torch.where(squared >= upper**2, c * c, middle))
+    torch.testing.assert_close(robust.cost("truncated", upper, squared, c), expected)
+    torch.testing.assert_close(robust.cost("truncated", c, squared), squared.clamp_max(c * c))
 
 
 def with_outliers(problem: Problem, share: float, jump_px: float, seed: int = 4) -> Problem:
@@ -106,6 +117,40 @@ def test_graduation_finds_the_answer_that_a_narrow_kernel_misses(robust_kernel: 
     # Judged with the same kernel, wherever the descent began.
     assert graduated.initial_cost == narrow.initial_cost
     assert graduated.iterations <= 60
+
+
+def test_truncated_least_squares_finds_what_outliers_hide() -> None:
+    """From a start far off with 30 % of the measurements anywhere in the picture, it is least squares of the others."""
+    problem, truth = noisy(0.1)
+    rng = torch.Generator().manual_seed(4)
+    target_px = problem.edges.target_px
+    hit = torch.rand(target_px.shape[:2], generator=rng)[..., None] < 0.3
+    anywhere = torch.rand(target_px.shape, generator=rng, dtype=torch.float64) * torch.tensor([96.0, 80.0])
+    clean = replace(problem.edges, weight=problem.edges.weight * ~hit)
+    poses = problem.free.poses.clone()
+    poses[1] = False  # holds the scale
+    free = replace(problem.free, poses=poses, focal=False)
+    problem = replace(problem, free=free, edges=replace(problem.edges, target_px=torch.where(hit, anywhere, target_px)))
+    best = solve(replace(problem, edges=clean), truth, Options(max_iterations=40, robust="none"))
+    start = disturbed(truth, seed=2, twist=0.15, depth=0.2, log_focal=0.0)
+    held = start.cam_from_world.clone()
+    held[1] = truth.cam_from_world[1]
+
+    def error(robust_kernel: RobustKernel, first_px: float | None) -> float:
+        options = Options(
+            max_iterations=80,
+            robust=robust_kernel,
+            robust_scale_px=1.0,
+            initial_scale_px=first_px,
+            relative_tolerance=1e-6,
+        )
+        found = solve(problem, replace(start, cam_from_world=held), options).state
+        return float((found.cam_from_world - best.state.cam_from_world).abs().max())
+
+    assert error("truncated", math.inf) < 1e-3
+    assert error("truncated", None) > 0.1
+    assert error("tukey", None) > 0.1
+    assert error("huber", None) > 0.02
 
 
 def test_graduation_ends_at_the_scale_asked_for() -> None:

@@ -31,14 +31,15 @@ class Answer(NamedTuple):
     report: Tensor
 
 
-def _num_cameras(state: State) -> int:
+def num_cameras(state: State) -> int:
+    """How many intrinsics a state has: one, or one for each view of a rig."""
     return 1 if state.intrinsics.ndim == 1 else len(state.intrinsics)
 
 
 def report_size(problem: Problem, state: State, *, extrinsics: bool = True) -> int:
     """Numbers in a report, or without what it says of extrinsics."""
     refined = len(state.cam_from_rig) if extrinsics and problem.refines_rig and state.cam_from_rig is not None else 0
-    return _NUMBERS + 4 * _num_cameras(state) + 36 * refined
+    return _NUMBERS + 4 * num_cameras(state) + 36 * refined
 
 
 def answer_of(result: Result, size: int) -> Answer:
@@ -47,7 +48,7 @@ def answer_of(result: Result, size: int) -> Answer:
     numbers = [_STATUS.index(result.status), result.iterations, result.initial_cost, result.cost, result.weight_sum]
     numbers += [value for covariance in result.intrinsics_covariances for row in covariance for value in row]
     # Of several cameras that are held, a result has one covariance for all.
-    numbers += [0.0] * (_NUMBERS + 4 * _num_cameras(state) - len(numbers))
+    numbers += [0.0] * (_NUMBERS + 4 * num_cameras(state) - len(numbers))
     if result.extrinsic_covariances is not None:
         numbers += result.extrinsic_covariances.flatten().tolist()
     # Where nothing was solved there is less to say.
@@ -72,7 +73,7 @@ def result_of(answer: Answer, given: State) -> Result:
         None if given.cam_from_rig is None else answer.cam_from_rig,
     )
     solved = status not in (Status.NON_FINITE, Status.EMPTY)
-    rest = _NUMBERS + 4 * _num_cameras(given)
+    rest = _NUMBERS + 4 * num_cameras(given)
     extrinsic = torch.tensor(report[rest:], dtype=torch.float64).view(-1, 6, 6)
     return Result(
         state if solved else given,

@@ -18,7 +18,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from vipe_core.ba import block_cholesky, kernels
+from vipe_core.ba import block_cholesky, kernels, robust
 from vipe_core.ba.problem import Options, Problem, State
 from vipe_core.ba.reduced import add_frames, add_twists, damp
 from vipe_core.ba.reprojection import cameras_of, min_depth_factor
@@ -45,7 +45,7 @@ class HostSystem:
         pose: What the kernels need of the state.
         adjoint: (E, 6, 6) of target_from_source, edges in order.
         state: Where.
-        scale: (1,) squared scale of the robust kernel, px^2.
+        scale: (2,) squares of the robust kernel's scale and of the one it ends at, px^2.
         cost: By-product of the linearisation.
     """
 
@@ -109,7 +109,7 @@ class HostSolver:
         self._shared = self._num_unknown if self._free.any() else -1
         self._per_frame = None if problem.rig is None else self._structure_of_frames()
 
-        self._kernel = kernels.ROBUST_CODE[options.robust]
+        self._kernel = robust.CODE[options.robust]
         self._sample_px = problem.grid.sample_px()
         self._rays: tuple[Tensor, Array, Array, Array] | None = None
         self._seen: tuple[State, kernels.Pose, Tensor] | None = None
@@ -216,9 +216,12 @@ class HostSolver:
             for done in [pool.submit(work, begin, end) for begin, end in pairwise(bounds.tolist())]:
                 done.result()
 
-    def _number(self, value: float) -> Array:
-        """A scalar in the dtype of the pixels, as the kernels take it."""
-        return np.full(1, value, self._graph.weight.dtype)
+    def _numbers(self, *values: float) -> Array:
+        """Scalars in the dtype of the pixels, as the kernels take them."""
+        return np.array(values, self._graph.weight.dtype)
+
+    def _scale(self, scale_px: float) -> Array:
+        return self._numbers(scale_px**2, self.options.robust_scale_px**2)
 
     def _cost(self, sums: Array, state: State) -> Cost:
         measurements, weight, everything, prior = sums.sum(axis=0).tolist()
@@ -237,7 +240,7 @@ class HostSolver:
     def cost(self, state: State, scale_px: float) -> Cost:
         """The robust cost at a state."""
         pose, _ = self._pose(state)
-        sums, scale = np.zeros((len(self._depth_free), 4)), self._number(scale_px**2)
+        sums, scale = np.zeros((len(self._depth_free), 4)), self._scale(scale_px)
         self._over_frames(
             lambda begin, end: kernels.evaluate(self._graph, pose, self._prior, self._kernel, scale, begin, end, sums)
         )
@@ -246,7 +249,7 @@ class HostSolver:
     def linearise(self, state: State, scale_px: float) -> HostSystem:
         """The normal equations at a state."""
         pose, transform = self._pose(state)
-        graph, structure, scale = self._graph, self._structure, self._number(scale_px**2)
+        graph, structure, scale = self._graph, self._structure, self._scale(scale_px)
         sums = np.zeros((len(self._depth_free), 4))
         per_edge = np.zeros(kernels.ROWS**2 * len(self._source))
         per_frame = np.zeros(self._offset[-1])
@@ -380,7 +383,7 @@ class HostSolver:
             twist[:, :6] = total[self._target.numpy()] - moved
             twist[:, 6], twist[:, 7] = log_focal, alpha
             gain = np.empty(len(self._depth_free))
-            damping_of, out = self._number(damping), depth.numpy()
+            damping_of, out = self._numbers(damping), depth.numpy()
             self._over_frames(
                 lambda begin, end: kernels.back_substitute(
                     self._graph,

@@ -27,12 +27,13 @@ TILE = 256
 # Rows of an edge: 6 of its twist, log f, alpha, negative residual.
 ROWS = 9
 TAIL = 3
-ROBUST_CODE = {"none": 0, "huber": 1, "cauchy": 2, "geman_mcclure": 3, "tukey": 4}
 
 # Rows of the view buffer: homogeneous point, 1 / s, projection before focal length and centre, |X|, weighted residual,
 # roots of the weights, argument of the robust kernel, larger weight. Zero weights where the point is not imaged.
 _X, _Y, _Z, _INV, _PX, _PY, _NORM, _EU, _EV, _SU, _SV, _SQ, _WM = (k * TILE for k in range(13))
 _VIEW_SIZE = 13 * TILE
+# Least positive number that is not denormal in single precision.
+_TINY = 1.2e-38
 # Rows of the Jacobian buffer: ROWS pairs (u, v), then the derivative by inverse depth, then J_X.
 _RHS = 16 * TILE
 _BY_DEPTH = 18 * TILE
@@ -124,11 +125,10 @@ def _see(graph: Graph, pose: Pose, frame: int, order: int, start: int, n: int, v
 
 
 @vectorised
-def _rho_sum(kernel: int, c2: float, view: Array, n: int) -> tuple[float, float]:
+def _rho_sum(kernel: int, scale: Array, view: Array, n: int) -> tuple[float, float]:
     """Sums of wmax rho(s) and of wmax over a tile."""
-    squared, weight = view[_SQ : _SQ + TILE], view[_WM : _WM + TILE]
-    zero = view.dtype.type(0)
-    two = view.dtype.type(2)
+    squared, weight, c2 = view[_SQ : _SQ + TILE], view[_WM : _WM + TILE], scale[0]
+    zero, one, two = view.dtype.type(0), view.dtype.type(1), view.dtype.type(2)
     total, kept = zero, zero
     for p in range(n):
         kept += weight[p]
@@ -146,22 +146,31 @@ def _rho_sum(kernel: int, c2: float, view: Array, n: int) -> tuple[float, float]
     elif kernel == 3:
         for p in range(n):
             total += weight[p] * (squared[p] * c2 / (c2 + squared[p]))
-    else:
-        third, one = c2 / view.dtype.type(3), view.dtype.type(1)
+    elif kernel == 4:
+        third = c2 / view.dtype.type(3)
         for p in range(n):
-            inside = one - squared[p] / c2
-            inside = zero if inside < zero else inside
+            s = squared[p]
+            inside = one - s / c2 if s < c2 else s - s
             total += weight[p] * third * (one - inside * inside * inside)
+    else:
+        c, final2 = math.sqrt(c2), scale[1]
+        wide = max(c2 - final2, view.dtype.type(_TINY))
+        most = wide / c
+        for p in range(n):
+            s = squared[p]
+            root = math.sqrt(s)
+            gap = min(c - root, most) if root < c else root - root
+            total += weight[p] * (s if s * c2 <= final2 * final2 else final2 * (one - gap * (gap / wide)))
     return total, kept
 
 
 @vectorised
-def _reweigh(kernel: int, c2: float, view: Array, n: int) -> None:
+def _reweigh(kernel: int, scale: Array, view: Array, n: int) -> None:
     """Scale residuals and roots of weights by sqrt(rho'(s))."""
     if kernel == 0:
         return
-    one = view.dtype.type(1)
-    squared = view[_SQ : _SQ + TILE]
+    zero, one = view.dtype.type(0), view.dtype.type(1)
+    squared, c2 = view[_SQ : _SQ + TILE], scale[0]
     if kernel == 1:
         for p in range(n):
             s = squared[p]
@@ -172,10 +181,19 @@ def _reweigh(kernel: int, c2: float, view: Array, n: int) -> None:
     elif kernel == 3:
         for p in range(n):
             squared[p] = c2 / (c2 + squared[p])
-    else:
+    elif kernel == 4:
         for p in range(n):
             inside = one - squared[p] / c2
-            squared[p] = view.dtype.type(0) if inside < view.dtype.type(0) else inside
+            squared[p] = zero if inside < zero else inside
+    else:
+        c, final2 = math.sqrt(c2), scale[1]
+        wide = max(c2 - final2, view.dtype.type(_TINY))
+        most = wide / c
+        for p in range(n):
+            s = squared[p]
+            root = math.sqrt(s)
+            gap = min(max(c - root, zero), most)
+            squared[p] = one if s * c2 <= final2 * final2 else math.sqrt(final2 * (gap / wide) / root)
     for p in range(n):
         root = view[_SQ + p]
         view[_EU + p] *= root
@@ -331,8 +349,8 @@ def evaluate(
     """Robust cost of the frames begin:end.
 
     Args:
-        kernel: One of `ROBUST_CODE`.
-        scale: (1,) squared scale of the kernel, px^2.
+        kernel: Of `robust.CODE`.
+        scale: (2,) squares of the kernel's scale and of the one it ends at, px^2.
         sums: (N, 4) float64 zeros, filled with wmax rho(s), wmax of what is imaged, all wmax, and the prior's cost.
     """
     cells = pose.rays.shape[2]
@@ -346,7 +364,7 @@ def evaluate(
             n = min(TILE, cells - start)
             for order in range(graph.first[frame], graph.first[frame + 1]):
                 sums[frame, 2] += _see(graph, pose, frame, order, start, n, view)
-                cost, kept = _rho_sum(kernel, scale[0], view, n)
+                cost, kept = _rho_sum(kernel, scale, view, n)
                 sums[frame, 0] += cost
                 sums[frame, 1] += kept
             if graph.depth_free[frame]:
@@ -385,7 +403,7 @@ def linearise(
     view, jacobian = np.zeros(_VIEW_SIZE, dtype), np.zeros(_JACOBIAN_SIZE, dtype)
     coupling = np.zeros((6 * most + TAIL) * TILE, dtype)
     curvature, pull = np.zeros(TILE, dtype), np.zeros(TILE, dtype)
-    zero, one, tiny = dtype.type(0), dtype.type(1), dtype.type(1.2e-38)
+    zero, one, tiny = dtype.type(0), dtype.type(1), dtype.type(_TINY)
     for frame in range(begin, end):
         first, last = graph.first[frame], graph.first[frame + 1]
         degree = last - first
@@ -401,10 +419,10 @@ def linearise(
                     coupling[(6 * degree + 2) * TILE + p] = pull[p]
             for order in range(first, last):
                 sums[frame, 2] += _see(graph, pose, frame, order, start, n, view)
-                cost, kept = _rho_sum(kernel, scale[0], view, n)
+                cost, kept = _rho_sum(kernel, scale, view, n)
                 sums[frame, 0] += cost
                 sums[frame, 1] += kept
-                _reweigh(kernel, scale[0], view, n)
+                _reweigh(kernel, scale, view, n)
                 _differentiate(graph, pose, frame, order, start, n, free, view, jacobian)
                 _gram(jacobian, 3, 2 * TILE, direct, ROWS * ROWS * order)
                 if depth_free:
@@ -503,7 +521,7 @@ def back_substitute(
     """
     cells, dtype = pose.rays.shape[2], pose.rays.dtype
     view, change, sums = np.zeros(_VIEW_SIZE, dtype), np.zeros(3 * TILE, dtype), np.zeros(3 * TILE, dtype)
-    zero, one, tiny = dtype.type(0), dtype.type(1), dtype.type(1.2e-38)
+    zero, one, tiny = dtype.type(0), dtype.type(1), dtype.type(_TINY)
     for frame in range(begin, end):
         first, last = graph.first[frame], graph.first[frame + 1]
         gain[frame] = 0
@@ -516,7 +534,7 @@ def back_substitute(
                 sums[2 * TILE + p] = sums[TILE + p]
             for order in range(first, last):
                 _see(graph, pose, frame, order, start, n, view)
-                _reweigh(kernel, scale[0], view, n)
+                _reweigh(kernel, scale, view, n)
                 _follow(graph, pose, twist[order], order, frame, start, n, view, change, sums)
             out = step[frame][start : start + n]
             total = zero

@@ -221,7 +221,8 @@ def _wider_scales(problem: Problem, state: State, options: Options) -> list[floa
     """Scales of the robust kernel before the one asked for, narrowing.
 
     Geman-McClure with squared scale mu c^2 is convex where s < mu c^2 / 3; Yang et al. 2020 begin at mu c^2 = 2 max s
-    and divide mu by 1.4. Here the steps are larger where more than half of the iterations would go into them.
+    and divide mu by 1.4, and so it is with the end of truncation (`robust.py`). Here the steps are larger where more
+    than half of the iterations would go into them.
     """
     final, first = options.robust_scale_px, options.initial_scale_px
     if first is None or options.robust == "none":
@@ -278,7 +279,8 @@ def _finite(problem: Problem, state: State) -> bool:
 
 def _lost_rho(options: Options, scale_px: float, cost: Cost) -> Tensor:
     """What a measurement costs whose point is not in front of its camera: as much as a gross outlier, px^2."""
-    outlier = robust.cost(options.robust, scale_px, torch.full_like(cost.weight, (10 * scale_px) ** 2))
+    far = torch.full_like(cost.weight, (10 * scale_px) ** 2)
+    outlier = robust.cost(options.robust, scale_px, far, options.robust_scale_px)
     return torch.maximum(outlier, 4 * cost.measurements / cost.weight)
 
 

@@ -26,7 +26,7 @@ from vipe_core.cameras import CameraModel
 
 Covariance = tuple[tuple[float, float], tuple[float, float]]
 NO_COVARIANCE: Covariance = ((0.0, 0.0), (0.0, 0.0))
-RobustKernel = Literal["none", "huber", "cauchy", "geman_mcclure", "tukey"]
+RobustKernel = Literal["none", "huber", "cauchy", "geman_mcclure", "tukey", "truncated"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -189,10 +189,12 @@ class Options:
     Attributes:
         max_iterations: Upper bound of accepted plus rejected steps.
         relative_tolerance: Stop when a step lowers the cost, or is expected to, by less than this share.
-        robust: Kernel on the 2-norm of the residual in pixels.
+        robust: Kernel on the 2-norm of the residual in pixels. `truncated` is truncated least squares, min(s, c^2):
+            what is further off than c has no say at all, so it needs a start within c, or graduation.
         robust_scale_px: Its scale c.
         initial_scale_px: Graduated non-convexity (Yang et al. 2020): the scale to begin with, which narrows to c as the
-            cost is lowered; infinity begins where a Geman-McClure kernel is convex over all residuals. None is c.
+            cost is lowered; infinity begins where a Geman-McClure or truncated kernel is convex over all residuals.
+            None is c.
         initial_damping: First LM damping of the (scaled) reduced system.
         min_inverse_depth: Lower clamp of inverse depth after a step, relative to the median of the problem's.
         max_inverse_depth: Upper clamp, likewise.

@@ -13,7 +13,7 @@ from vipe_core.ba.reprojection import reproject
 
 # Scale over standard deviation at which a kernel on the norm of a two-dimensional Gaussian residual keeps 95 % of the
 # efficiency of least squares: the c that solves (E[w + r w' / 2])^2 = 0.95 E[r^2 w^2] / 2 for the kernel's weight w(r).
-_EFFICIENT_RATIO = {"none": 1.0, "huber": 1.50, "cauchy": 2.55, "geman_mcclure": 4.10, "tukey": 5.12}
+_EFFICIENT_RATIO = {"none": 1.0, "huber": 1.50, "cauchy": 2.55, "geman_mcclure": 4.10, "tukey": 5.12, "truncated": 3.08}
 # The norm of a two-dimensional Gaussian is Rayleigh distributed; its median over the standard deviation of a component.
 _RAYLEIGH_MEDIAN = math.sqrt(2 * math.log(2))
 _BATCH_CELLS = 1 << 18

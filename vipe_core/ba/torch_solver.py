@@ -233,7 +233,7 @@ class TorchSolver:
     ) -> None:
         """Add robust cost, valid weight, all weight and depth prior of a chunk to `sums` (4,)."""
         kept_weight = measured.max_weight * view.valid
-        rho = robust.cost(self.options.robust, scale_px, view.squared)
+        rho = robust.cost(self.options.robust, scale_px, view.squared, self.options.robust_scale_px)
         sums[0] += (rho * kept_weight).sum(-1).double().sum()
         sums[1] += kept_weight.sum(-1).double().sum()
         sums[2] += measured.max_weight.sum(-1).double().sum()
@@ -277,7 +277,7 @@ class TorchSolver:
         at_source, at_target = self._cameras(chunk)
         scale = measured.root_weight * view.valid[:, :, None]
         residual = view.weighted
-        slope = robust.root_slope(self.options.robust, scale_px, view.squared)
+        slope = robust.root_slope(self.options.robust, scale_px, view.squared, self.options.robust_scale_px)
         if slope is not None:
             scale = scale * slope[:, :, None]
             residual = residual * slope[:, :, None]

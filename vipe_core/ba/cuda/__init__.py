@@ -26,21 +26,15 @@ from vipe_core.ba.problem import Options, Problem, State
 
 
 def takes(problem: Problem, state: State) -> bool:
-    """Whether the kernels are for a problem: single precision, something measured, and no intrinsics of several views
-    that are free at once. An edge between two such cameras has more unknowns of its own than the registers hold."""
-    intrinsics_free = problem.free.focal or problem.free.distortion
-    return (
-        state.inverse_depth.dtype == torch.float32
-        and len(problem.edges.source) > 0
-        and not (state.intrinsics.ndim > 1 and intrinsics_free)
-    )
+    """Whether the kernels are for a problem: single precision, and something measured."""
+    return state.inverse_depth.dtype == torch.float32 and len(problem.edges.source) > 0
 
 
 def prepare(problem: Problem, state: State, options: Options) -> Adjustment | None:
     """A problem that the kernels take, ready to run; None where they cannot be compiled or loaded (logged once)."""
     device = state.inverse_depth.device
     index = torch.cuda.current_device() if device.index is None else device.index
-    launcher = device_launcher(index, specialisation(problem, options))
+    launcher = device_launcher(index, specialisation(problem, state, options))
     if launcher is None:
         return None
     return Adjustment(problem, state, options, launcher)

@@ -16,13 +16,13 @@ from typing import Any
 
 from vipe_core.ba.cuda.context import CONTEXT_BYTES, CONTROL_BYTES
 from vipe_core.ba.problem import RobustKernel
+from vipe_core.ba.robust import CODE
+from vipe_core.ba.solver import ALPHA_RANGE, MAX_LOG_FOCAL_STEP, MIN_CURVATURE
 
 _COMMON = ("context.cu", "pixel.cu")
 _SYSTEM = ("largest.cu", "reduce.cu", "factor.cu", "descent.cu")
 _TILE = ("tile.cu",)
 
-# As `Robust` in `kernels/context.cu`.
-ROBUST_CODE: dict[RobustKernel, int] = {"none": 0, "huber": 1, "cauchy": 2, "geman_mcclure": 3, "tukey": 4}
 SYSTEM_KERNELS = (
     *("begin", "widen", "transform", "largest", "fold", "turn", "assemble", "judge"),
     *("damp", "gather", "factorise", "substitute", "propose", "covariance", "finish"),
@@ -32,34 +32,39 @@ TILE_KERNELS = ("tile", "tile_large")
 
 @dataclass(frozen=True, slots=True)
 class Specialisation:
-    """What the pass over the cells is compiled for."""
+    """What the pass over the cells is compiled for: camera, free intrinsics, the kernel of the residuals, and whether
+    several cameras have these intrinsics each for itself."""
 
     unified: bool
     focal: bool
     alpha: bool
     robust: RobustKernel
+    apart: bool = False
 
     @property
     def resident_blocks(self) -> dict[str, int]:
         """Blocks of threads of each kernel that a multiprocessor should hold: at most 65536 / 128 / blocks registers
         per thread."""
+        if self.apart:
+            return dict.fromkeys(TILE_KERNELS, 2 if self.focal and self.alpha else 3)
         return dict(zip(TILE_KERNELS, (3 if self.alpha else 4, 3), strict=True))
 
     def definition(self, suffix: str = "") -> str:
         """The two kernels of this specialisation; their names end in `suffix`."""
-        flags = ", ".join(str(flag).lower() for flag in (self.unified, self.focal, self.alpha))
+        flags = ", ".join(str(flag).lower() for flag in (self.unified, self.focal, self.alpha, self.apart))
         kernels = zip(self.resident_blocks.items(), ("false", "true"), strict=True)
         return "".join(
-            f"DEFINE_TILE_KERNEL({name}{suffix}, {flags}, {ROBUST_CODE[self.robust]}, {large}, {blocks})\n"
+            f"DEFINE_TILE_KERNEL({name}{suffix}, {flags}, {CODE[self.robust]}, {large}, {blocks})\n"
             for (name, blocks), large in kernels
         )
 
 
 def specialisations() -> Iterable[Specialisation]:
     """All there are: alpha is an intrinsic of the unified camera only."""
-    for robust in ROBUST_CODE:
+    for robust in CODE:
         for unified, focal, alpha in ((0, 0, 0), (0, 1, 0), (1, 0, 0), (1, 1, 0), (1, 0, 1), (1, 1, 1)):
-            yield Specialisation(bool(unified), bool(focal), bool(alpha), robust)
+            for apart in (False, True) if focal or alpha else (False,):
+                yield Specialisation(bool(unified), bool(focal), bool(alpha), robust, apart)
 
 
 def _read(names: Iterable[str]) -> str:
@@ -69,17 +74,26 @@ def _read(names: Iterable[str]) -> str:
 
 def system_source() -> str:
     """Everything but the pass over the cells."""
-    return _sizes() + _read(_COMMON + _SYSTEM)
+    return _constants() + _read(_COMMON + _SYSTEM)
 
 
 def tile_source(chosen: Iterable[Specialisation], *, numbered: bool = False) -> str:
     """The pass over the cells; kernels of several specialisations are numbered to tell them apart."""
     definitions = (kind.definition(f"_{k}" if numbered else "") for k, kind in enumerate(chosen))
-    return _sizes() + _read(_COMMON + _TILE) + "".join(definitions)
+    return _constants() + _read(_COMMON + _TILE) + "".join(definitions)
 
 
-def _sizes() -> str:
-    return f"#define CONTEXT_BYTES {CONTEXT_BYTES}\n#define CONTROL_BYTES {CONTROL_BYTES}\n"
+def _constants() -> str:
+    """What the kernels must not have another opinion of."""
+    constants = {
+        "CONTEXT_BYTES": CONTEXT_BYTES,
+        "CONTROL_BYTES": CONTROL_BYTES,
+        "MIN_CURVATURE": MIN_CURVATURE,
+        "MAX_LOG_FOCAL_STEP": MAX_LOG_FOCAL_STEP,
+        "MIN_ALPHA": ALPHA_RANGE[0],
+        "MAX_ALPHA": ALPHA_RANGE[1],
+    }
+    return "".join(f"#define {name} {value}\n" for name, value in constants.items())
 
 
 def cache_folder() -> Path:

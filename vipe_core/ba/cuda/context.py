@@ -5,16 +5,16 @@ from __future__ import annotations
 import ctypes
 
 _SIZES = (
-    "num_frames num_edges num_cells width num_units num_slices num_nodes num_blocks num_sides "
+    "num_frames num_edges num_cells width num_units num_slices num_nodes num_tail num_intrinsics num_blocks num_sides "
     "unified focal_free alpha_free robust anything_free max_iterations has_prior scratch_stride "
-    "num_cameras num_views views_free has_view_prior num_pool"
+    "num_cameras apart num_views views_free has_view_prior num_pool"
 )
 _SETTINGS = (
     "stride offset robust_scale first_scale tolerance initial_damping min_damping min_depth_ratio "
-    "min_depth max_depth log_focal log_focal_information"
+    "min_depth max_depth log_focal_information"
 )
 _ADDRESSES = (
-    "target_px weight prior_value prior_weight finite median largest prior_view prior_sigma "
+    "target_px weight prior_value prior_weight finite median largest prior_log_focal prior_view prior_sigma "
     "pose depth intrinsics view "
     "frame_node frame_view frame_camera view_node node_view "
     "edge_id edge_source edge_target edge_transform edge_adjoint edge_twist pose_step "
@@ -22,7 +22,7 @@ _ADDRESSES = (
     "partial scratch pool pool_row pool_column unit_sums "
     "block_row block_column direct_first direct_entry eliminated_first eliminated_entry diagonal_block blocks "
     "tile_row tile_column tile_first product_left product_right tile_block_first tile_block "
-    "column_diagonal column_first column_tile level_column factor diagonal_factor scale solution "
+    "column_diagonal column_first column_tile level_column factor diagonal_factor scale solution inverse "
     "control report"
 )
 

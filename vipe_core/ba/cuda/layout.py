@@ -28,12 +28,45 @@ TILE_THREADS = 128
 SIDE_BLOCKS = 8
 SIDE = 6 * SIDE_BLOCKS
 _FIXED_FLOATS = 20 + 10 * TILE + 2 * TILE + TILE_THREADS // 32 * 4 * TILE
-_PRODUCT_STRIDE = (32, 40, 48)
+_PRODUCT_STRIDE = {0: 32, 1: 40, 2: 48, 4: 72}
 
 # What every GPU since compute capability 8.0 can give a block of threads: 99 KiB.
 _MAX_SHARED_FLOATS = 99 * 256
 # Edges of a frame whose depths are held that one block of threads takes.
 _HELD_EDGES = 16
+
+
+@dataclass(frozen=True, slots=True)
+class Tail:
+    """The last columns of the reduced system: free intrinsics of one camera after the other, then the right-hand side.
+
+    Attributes:
+        free: How many of log f and alpha are free.
+        cameras: How many have them each for itself.
+    """
+
+    free: int
+    cameras: int = 1
+
+    @property
+    def intrinsics(self) -> int:
+        """Unknown intrinsics of all cameras."""
+        return self.free * self.cameras
+
+    @property
+    def apart(self) -> bool:
+        """Whether the two cameras of an edge have intrinsics of their own."""
+        return self.free > 0 and self.cameras > 1
+
+    @property
+    def nodes(self) -> int:
+        """Of six columns each."""
+        return self.intrinsics // 6 + 1
+
+    @property
+    def product_stride(self) -> int:
+        """Numbers that an edge leaves of the products of its rows."""
+        return _PRODUCT_STRIDE[2 * self.free if self.apart else self.free]
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,15 +113,16 @@ class Layout:
         return len(self.tables["column_diagonal"])
 
 
-def unit_floats(count: int, depth_free: bool, intrinsics: int) -> int:
+def unit_floats(count: int, depth_free: bool, tail: Tail) -> int:
     """Numbers for the rows and products of a tile of a unit of `count` edges (`TileLayout` of the kernel)."""
-    slots = count + 1 if depth_free else 0
+    slots = count + tail.nodes if depth_free else 0
     pairs = slots * (slots + 1) // 2
     groups = 1
     while groups < TILE // 4 and 2 * groups * pairs <= TILE_THREADS:
         groups *= 2
     stride = TILE + (4 * groups if groups < 8 else 0)
-    return 6 * slots * stride + 36 * pairs * groups + count * _PRODUCT_STRIDE[intrinsics]
+    by_camera = TILE_THREADS // 32 * tail.intrinsics * TILE if depth_free and tail.apart else 0
+    return 6 * slots * stride + 36 * pairs * groups + count * tail.product_stride + by_camera
 
 
 def build_layout(
@@ -97,7 +131,7 @@ def build_layout(
     unknowns: Unknowns,
     free_depths: NDArray[np.bool_],
     cells: int,
-    intrinsics: int,
+    tail: Tail,
 ) -> Layout:
     """Lay out a graph.
 
@@ -106,7 +140,7 @@ def build_layout(
         unknowns: What moves.
         free_depths: (N,).
         cells: Cells of a frame.
-        intrinsics: How many of log f and alpha are free.
+        tail: Which intrinsics are free.
     """
     num_frames, slices = len(free_depths), -(-cells // SLICE)
     order = np.argsort(source * num_frames + target, kind="stable")
@@ -114,15 +148,15 @@ def build_layout(
     first = np.zeros(num_frames + 1, np.int64)
     first[1:] = np.cumsum(np.bincount(source, minlength=num_frames))
 
-    units, num_large = _units(first, free_depths, intrinsics)
+    units, num_large = _units(first, free_depths, tail)
     frame, begin, count, free = units.T
     poses, views, num_nodes = _nodes(unknowns, target, units)
     behind = _Behind(poses[unknowns.pose_of_frame], views[unknowns.view_of_frame], num_nodes, unknowns.rig)
 
-    triangle = (count + 1) * (count + 2) // 2 * free
-    partial = (36 * triangle + count * _PRODUCT_STRIDE[intrinsics] + 2) * slices
-    direct = _starts(3 * count + 3)
-    eliminated = direct[-1] + _starts((count + 2) * (count + 3) // 2 * free)
+    triangle = (count + tail.nodes) * (count + tail.nodes + 1) // 2 * free
+    partial = (36 * triangle + count * tail.product_stride + 2) * slices
+    direct = _starts((2 + tail.nodes) * count + 1 + tail.nodes + tail.nodes * (tail.nodes + 1) // 2)
+    eliminated = direct[-1] + _starts((count + 1 + tail.nodes) * (count + 2 + tail.nodes) // 2 * free)
     tables = {
         "frame_node": behind.pose,
         "frame_view": unknowns.view_of_frame,
@@ -140,9 +174,10 @@ def build_layout(
         "unit_direct": direct[:-1],
         "unit_eliminated": eliminated[:-1],
     }
-    floats = [unit_floats(int(n), bool(f), intrinsics) for n, f in zip(count, free, strict=True)]
-    tables |= _blocks(units, target, behind, direct, eliminated)
-    factor, level_tiles, level_columns = _factor(tables["block_row"], tables["block_column"], num_nodes)
+    floats = [unit_floats(int(n), bool(f), tail) for n, f in zip(count, free, strict=True)]
+    tables |= _blocks(units, target, behind, tail.nodes, direct, eliminated)
+    num_sides = (6 * num_nodes + tail.intrinsics) // SIDE + 1
+    factor, level_tiles, level_columns = _factor(tables["block_row"], tables["block_column"], num_sides)
     tables |= factor
     wide = {"unit_partial", "unit_direct", "unit_eliminated"}
     return Layout(
@@ -169,7 +204,7 @@ def _starts(sizes: Ints) -> Ints:
     return starts
 
 
-def _units(first: Ints, free_depths: NDArray[np.bool_], intrinsics: int) -> tuple[Ints, int]:
+def _units(first: Ints, free_depths: NDArray[np.bool_], tail: Tail) -> tuple[Ints, int]:
     """(U, 4) frame, first edge, edges, whether depths are free: large ones first, then by falling size."""
     rows: list[tuple[bool, int, int, int, bool]] = []
     for frame, free in enumerate(free_depths.tolist()):
@@ -177,7 +212,7 @@ def _units(first: Ints, free_depths: NDArray[np.bool_], intrinsics: int) -> tupl
         piece = end - begin if free else _HELD_EDGES
         for start in range(begin, end, max(piece, 1)):
             count = min(piece, end - start)
-            small = _FIXED_FLOATS + unit_floats(count, free, intrinsics) <= _MAX_SHARED_FLOATS
+            small = _FIXED_FLOATS + unit_floats(count, free, tail) <= _MAX_SHARED_FLOATS
             rows.append((small, -count, frame, start, free))
     rows.sort()
     units = np.array([(frame, start, -count, free) for _, count, frame, start, free in rows], np.int64)
@@ -250,9 +285,13 @@ def _nodes(unknowns: Unknowns, target: Ints, units: Ints) -> tuple[Ints, Ints, i
     return place[: len(unknowns.poses)], place[len(unknowns.poses) :], num_nodes
 
 
-def _blocks(units: Ints, target: Ints, behind: _Behind, direct: Ints, eliminated: Ints) -> dict[str, Array]:
+def _blocks(
+    units: Ints, target: Ints, behind: _Behind, num_tail: int, direct: Ints, eliminated: Ints
+) -> dict[str, Array]:
     """The blocks of the reduced system on and below the diagonal, and what each of them sums."""
-    tail, size = behind.num_nodes, int(eliminated[-1])
+    num_frames, num_nodes, size = len(behind.pose), behind.num_nodes + num_tail, int(eliminated[-1])
+    pose = np.append(behind.pose, behind.num_nodes + np.arange(num_tail))
+    view = np.append(behind.view, np.full(num_tail, -1))
     keys: list[Ints] = []
     entries: list[Ints] = []
     kinds: list[Ints] = []
@@ -263,19 +302,19 @@ def _blocks(units: Ints, target: Ints, behind: _Behind, direct: Ints, eliminated
         for flip, chosen in ((0, rows >= columns), (1, (rows < columns) | (rows == columns) & mixed)):
             use = chosen & (rows >= 0) & (columns >= 0)
             low, high = np.minimum(rows, columns)[use], np.maximum(rows, columns)[use]
-            keys.append(high * (tail + 1) + low)
+            keys.append(high * num_nodes + low)
             entries.append(2 * block[use] + flip)
             kinds.append(np.full(int(use.sum()), kind))
 
     def add_slots(slots: Ints, rows: Ints, columns: Ints, block: Ints, kind: int) -> None:
-        """Sum the blocks of pairs of slots of units, frames or -1 for the tail, into what is behind them."""
+        """Sum the blocks of pairs of slots of units, frames and then nodes of the tail, into what is behind them."""
         above, beside = slots[:, rows], slots[:, columns]
         mixed = np.broadcast_to(rows != columns, block.shape)
-        pose, view = np.append(behind.pose, tail), np.append(behind.view, -1)
         if not behind.rig:
             add(pose[above], pose[beside], mixed, block, kind)
             return
-        frames[0, block], frames[1, block] = above, beside
+        for number, some in enumerate((above, beside)):
+            frames[number, block] = np.where(some < num_frames, some, -1)
         add(pose[above], pose[beside], mixed, block + _POSES * size, kind)
         if behind.parts > 2:
             add(view[above], view[beside], mixed, block + _FRAMES * size, kind)
@@ -286,38 +325,41 @@ def _blocks(units: Ints, target: Ints, behind: _Behind, direct: Ints, eliminated
     # Units of one shape at a time.
     for count, free in sorted({(int(c), int(f)) for c, f in units[:, 2:]}):
         chosen = np.flatnonzero((units[:, 2] == count) & (units[:, 3] == free))
-        slots = np.full((len(chosen), count + 2), -1)
+        end = count + 1 + np.arange(num_tail)
+        slots = np.empty((len(chosen), count + 1 + num_tail), np.int64)
         slots[:, 0] = units[chosen, 0]
-        slots[:, 1:-1] = target[units[chosen, 1][:, None] + np.arange(count)]
-        m = np.arange(count)
-        zero, end = np.zeros(count, np.int64), np.full(count, count + 1)
-        # Three blocks per edge: (target, target), (target, source), (tail, target); then (source, source) and so on.
-        rows = np.concatenate((np.stack((m + 1, m + 1, end), 1).ravel(), [0, count + 1, count + 1]))
-        columns = np.concatenate((np.stack((m + 1, zero, m + 1), 1).ravel(), [0, 0, count + 1]))
-        add_slots(slots, rows, columns, direct[chosen][:, None] + np.arange(3 * count + 3), 0)
+        slots[:, 1:-num_tail] = target[units[chosen, 1][:, None] + np.arange(count)]
+        slots[:, -num_tail:] = num_frames + np.arange(num_tail)
+        # Per edge (target, target), (target, source), (tail, target); then (source, source) and so on.
+        m = np.arange(1, count + 1)[:, None]
+        rows = np.hstack((m, m, np.broadcast_to(end, (count, num_tail)))).ravel()
+        columns = np.hstack((m, 0 * m, np.broadcast_to(m, (count, num_tail)))).ravel()
+        corner = np.tril_indices(num_tail)
+        rows = np.concatenate((rows, [0], end, end[corner[0]]))
+        columns = np.concatenate((columns, [0], 0 * end, end[corner[1]]))
+        add_slots(slots, rows, columns, direct[chosen][:, None] + np.arange(len(rows)), 0)
         if free:
-            rows, columns = np.tril_indices(count + 2)
+            rows, columns = np.tril_indices(count + 1 + num_tail)
             add_slots(slots, rows, columns, eliminated[chosen][:, None] + np.arange(len(rows)), 1)
 
     key, entry, kind = np.concatenate(keys), np.concatenate(entries), np.concatenate(kinds)
     unique = np.unique(key)
-    found: dict[str, Array] = {"block_row": unique // (tail + 1), "block_column": unique % (tail + 1)}
+    found: dict[str, Array] = {"block_row": unique // num_nodes, "block_column": unique % num_nodes}
     for name, code in (("direct", 0), ("eliminated", 1)):
         at = np.searchsorted(unique, key[kind == code])
         sorted_by = np.argsort(at, kind="stable")
         found[f"{name}_first"] = _starts(np.bincount(at, minlength=len(unique)))
         found[f"{name}_entry"] = entry[kind == code][sorted_by]
-    nodes = np.arange(tail + 1)
-    found["diagonal_block"] = np.searchsorted(unique, nodes * (tail + 1) + nodes)
+    nodes = np.arange(num_nodes)
+    found["diagonal_block"] = np.searchsorted(unique, nodes * num_nodes + nodes)
     found["pool_row"], found["pool_column"] = frames
     return found
 
 
 def _factor(
-    block_row: Ints, block_column: Ints, num_nodes: int
+    block_row: Ints, block_column: Ints, num_sides: int
 ) -> tuple[dict[str, Array], tuple[int, ...], tuple[int, ...]]:
     """Tiles of the factor with its fill, by the level at which their column can be eliminated."""
-    num_sides = num_nodes // SIDE_BLOCKS + 1
     below: list[set[int]] = [{num_sides - 1} for _ in range(num_sides)]
     row_side, column_side = block_row // SIDE_BLOCKS, block_column // SIDE_BLOCKS
     for row, column in {*zip(row_side.tolist(), column_side.tolist(), strict=True)}:

@@ -16,27 +16,40 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from vipe_core.ba.answer import Answer, report_size
-from vipe_core.ba.cuda.compiler import ROBUST_CODE, Specialisation
+from vipe_core.ba.answer import Answer, num_cameras, report_size
+from vipe_core.ba.cuda.compiler import Specialisation
 from vipe_core.ba.cuda.context import CONTROL_BYTES, Context
 from vipe_core.ba.cuda.launcher import Launcher
-from vipe_core.ba.cuda.layout import LARGE_SHARED_BYTES, SIDE, SLICE, TILE, TILE_THREADS, Layout, Unknowns, build_layout
+from vipe_core.ba.cuda.layout import (
+    LARGE_SHARED_BYTES,
+    SIDE,
+    SLICE,
+    TILE,
+    TILE_THREADS,
+    Layout,
+    Tail,
+    Unknowns,
+    build_layout,
+)
 from vipe_core.ba.problem import Options, Problem, State
 from vipe_core.ba.rigs import unknowns_of
+from vipe_core.ba.robust import CODE
 from vipe_core.ba.solver import MIN_DAMPING
 
 # As in `kernels/context.cu`.
 _EDGE_FLOATS = 20
+_TWIST_FLOATS = 10
 _WIDE_THREADS = 256
 _FACTOR_THREADS = 256
 _ASSEMBLE_BLOCKS = 7
 _COVARIANCE_ATTEMPTS = 3
 
 
-def specialisation(problem: Problem, options: Options) -> Specialisation:
+def specialisation(problem: Problem, state: State, options: Options) -> Specialisation:
     """The kernels that a problem needs."""
-    unified = problem.camera_model == "mei"
-    return Specialisation(unified, problem.free.focal, unified and problem.free.distortion, options.robust)
+    unified, free = problem.camera_model == "mei", problem.free
+    focal, alpha = free.focal, unified and free.distortion
+    return Specialisation(unified, focal, alpha, options.robust, (focal or alpha) and num_cameras(state) > 1)
 
 
 class Adjustment:
@@ -47,18 +60,19 @@ class Adjustment:
             on the host, which saves a wait for the device.
         state: float32 inverse depths, on that device.
         options: How to solve.
-        launcher: The kernels of `specialisation(problem, options)`.
+        launcher: The kernels of `specialisation(problem, state, options)`.
     """
 
     def __init__(self, problem: Problem, state: State, options: Options, launcher: Launcher) -> None:
         self._problem, self._state, self._options, self._launcher = problem, state, options, launcher
         self._device = state.inverse_depth.device
         edges, free, priors = problem.edges, problem.free, problem.priors
-        kind = specialisation(problem, options)
+        self._kind = kind = specialisation(problem, state, options)
         self._intrinsics_free = (kind.focal, kind.alpha)
         unknowns = unknowns_of(problem)
         self._num_views = 0 if state.cam_from_rig is None or problem.rig is None else len(state.cam_from_rig)
-        self._num_cameras = 1 if state.intrinsics.ndim == 1 else len(state.intrinsics)
+        self._num_cameras = num_cameras(state)
+        self._tail = Tail(kind.focal + kind.alpha, self._num_cameras if kind.apart else 1)
         views = torch.zeros(max(self._num_views, 1), dtype=torch.bool)
         views[: len(unknowns.views)] = unknowns.views
         self._views_free = bool(views.any())
@@ -69,7 +83,7 @@ class Adjustment:
             self._num_views > 0,
             self._num_cameras,
             problem.grid.num_cells,
-            sum(self._intrinsics_free),
+            self._tail,
         )
         self._tensors: dict[str, Tensor] = {}
         self._has_prior = priors.inverse_depth is not None and priors.inverse_depth_weight is not None
@@ -107,8 +121,8 @@ class Adjustment:
             "view": (double, (2, self._num_views, 16)),
             "edge_transform": (single, (2, count, _EDGE_FLOATS)),
             "edge_adjoint": (double, (count, 36)),
-            "edge_twist": (single, (count, 8)),
-            "pose_step": (double, (6 * frames + 2,)),
+            "edge_twist": (single, (count, _TWIST_FLOATS)),
+            "pose_step": (double, (6 * frames + 2 * self._num_cameras,)),
             "partial": (single, (layout.partial_size,)),
             "scratch": (single, (large_blocks * layout.scratch_stride,)),
             "pool": (double, (layout.pool_parts, layout.pool_size, 36)),
@@ -118,6 +132,7 @@ class Adjustment:
             "diagonal_factor": (double, (sides, SIDE, SIDE)),
             "scale": (double, (sides * SIDE,)),
             "solution": (double, (sides * SIDE,)),
+            "inverse": (double, (2, self._tail.intrinsics)),
             "control": (torch.uint8, (CONTROL_BYTES,)),
             "report": (double, (report_size(self._problem, self._state, extrinsics=False),)),
         }
@@ -133,12 +148,15 @@ class Adjustment:
 
     def _upload(self, layout: Layout) -> None:
         """All tables in one copy."""
+        log_focal = self._problem.priors.log_focal
+        of_cameras = np.broadcast_to(0.0 if log_focal is None else np.asarray(log_focal, float), self._num_cameras)
+        tables = layout.tables | {"prior_log_focal": of_cameras}
         offsets, size = {}, 0
-        for name, table in layout.tables.items():
+        for name, table in tables.items():
             offsets[name] = size
             size += -(-table.nbytes // 16) * 16
         packed = np.zeros(size, np.uint8)
-        for name, table in layout.tables.items():
+        for name, table in tables.items():
             packed[offsets[name] : offsets[name] + table.nbytes] = np.frombuffer(table.tobytes(), np.uint8)
         on_host = torch.from_numpy(packed)
         # Does not wait for the GPU: what is not pinned is copied to where the driver sends it from.
@@ -150,8 +168,7 @@ class Adjustment:
         frames, cells = self._state.inverse_depth.shape
         focal_free, alpha_free = self._intrinsics_free
         any_depth = bool(layout.tables["unit_free"].any())
-        log_focal = priors.log_focal[0] if isinstance(priors.log_focal, tuple) else priors.log_focal
-        information = 1 / priors.log_focal_sigma**2 if log_focal is not None and focal_free else 0.0
+        information = 1 / priors.log_focal_sigma**2 if priors.log_focal is not None and focal_free else 0.0
         context = Context(
             num_frames=frames,
             num_edges=len(problem.edges.source),
@@ -160,17 +177,20 @@ class Adjustment:
             num_units=layout.num_units,
             num_slices=self._slices,
             num_nodes=layout.num_nodes,
+            num_tail=self._tail.nodes,
+            num_intrinsics=self._tail.intrinsics,
             num_blocks=layout.num_blocks,
             num_sides=layout.num_sides,
             unified=problem.camera_model == "mei",
             focal_free=focal_free,
             alpha_free=alpha_free,
-            robust=ROBUST_CODE[options.robust],
+            robust=CODE[options.robust],
             anything_free=layout.num_nodes > 0 or focal_free or alpha_free or any_depth,
             max_iterations=options.max_iterations,
             has_prior=self._has_prior,
             scratch_stride=layout.scratch_stride,
             num_cameras=self._num_cameras,
+            apart=self._kind.apart,
             num_views=self._num_views,
             views_free=self._views_free,
             has_view_prior=self._has_view_prior,
@@ -185,7 +205,6 @@ class Adjustment:
             min_depth_ratio=options.min_depth_ratio,
             min_depth=options.min_inverse_depth,
             max_depth=options.max_inverse_depth,
-            log_focal=log_focal or 0.0,
             log_focal_information=information,
         )
         for name, tensor in self._tensors.items():
@@ -328,10 +347,10 @@ def _layout(
     rig: bool,
     cameras: int,
     cells: int,
-    intrinsics: int,
+    tail: Tail,
 ) -> Layout:
     """`build_layout`, kept for the graphs solved last: a schedule of kernels solves the same graph several times."""
     ints = [np.frombuffer(frames, np.int64) for frames in (source, target, pose_of_frame, view_of_frame)]
     flags = [np.frombuffer(free, np.bool_) for free in (poses, views, depths)]
     unknowns = Unknowns(ints[2], ints[3], flags[0], flags[1], rig, cameras)
-    return build_layout(ints[0], ints[1], unknowns, flags[2], cells, intrinsics)
+    return build_layout(ints[0], ints[1], unknowns, flags[2], cells, tail)

@@ -19,6 +19,8 @@ typedef long long i64;
 #define TILE_WARPS (TILE_THREADS / 32)
 // Numbers of an edge's transform and camera.
 #define EDGE_FLOATS 20
+// ... and of its twist, with the steps of the intrinsics of both its cameras.
+#define TWIST_FLOATS 10
 // Scalars of the reduced system per tile of its factor: eight blocks of six.
 #define SIDE 48
 #define SIDE_BLOCKS 8
@@ -26,9 +28,6 @@ typedef long long i64;
 #define WIDE_THREADS 256
 #define ASSEMBLE_BLOCKS 7
 
-#define MIN_CURVATURE 1e-12
-#define MAX_LOG_FOCAL_STEP 0.3
-#define MAX_ALPHA 1.2
 #define MAX_DAMPING 1e8
 #define ACCEPTED_FACTOR 0.2
 #define REJECTED_FACTOR 10.0
@@ -37,10 +36,13 @@ typedef long long i64;
 #define TRUSTED_DAMPING 1e-2
 #define NARROWING 1.4
 #define TINY 1.2e-38f
+// Of a report, before the covariances.
+#define REPORT_NUMBERS 5
 
 // RUNNING, then as `Status` of `vipe_core/ba/problem.py`.
 enum Status { RUNNING, CONVERGED, MAX_ITERATIONS, NO_PROGRESS, SINGULAR, NON_FINITE, EMPTY };
-enum Robust { NONE, HUBER, CAUCHY, GEMAN_MCCLURE, TUKEY };
+// As `CODE` of `vipe_core/ba/robust.py`.
+enum Robust { NONE, HUBER, CAUCHY, GEMAN_MCCLURE, TUKEY, TRUNCATED };
 // What the next pass over the cells is for: nothing, the normal equations at the state, or those of a candidate.
 enum Mode { IDLE, LINEARISE, STEP };
 
@@ -52,30 +54,32 @@ struct Control {
     i64 factorised;      // whether every pivot so far was positive
     i64 first;           // whether nothing has been judged yet
     i64 level, num_levels;  // of graduated non-convexity
-    i64 covariance_found;
+    i64 covariance_found;  // of every camera
     double damping;
     double scale_system, scale_judge, scale_next;  // of the accepted linearisation, of judging and of the next one
     double lost_rho, measured, weight, lost, prior;
     double initial_cost, initial_weight;
     double predicted, first_scale;
-    double covariance[4];
 };
 
 // Mirrored by `context.py`; every member has eight bytes.
 struct Context {
     i64 num_frames, num_edges, num_cells, width, num_units, num_slices;
-    i64 num_nodes;    // free poses and views; node `num_nodes` is the tail: free intrinsics, then the right-hand side
+    i64 num_nodes;    // free poses and views; after them comes the tail
+    i64 num_tail;     // nodes of the tail: the free intrinsics of one camera after the other, then the right-hand side
+    i64 num_intrinsics;  // how many of these there are
     i64 num_blocks;   // 6x6 blocks of the reduced system
     i64 num_sides;    // tiles along a side of the factor
     i64 unified, focal_free, alpha_free, robust, anything_free, max_iterations;
     i64 has_prior;
     i64 scratch_stride;  // floats of `scratch` per block
-    i64 num_cameras;     // with intrinsics of their own: 1, or the views of a rig, then none of them free
+    i64 num_cameras;     // with intrinsics of their own: 1, or the views of a rig
+    i64 apart;           // whether they are free, and there are several
     i64 num_views;       // of a rig; 0 without
     i64 views_free, has_view_prior;
     i64 num_pool;        // blocks of `pool` in each of its parts
     double stride, offset, robust_scale, first_scale, tolerance, initial_damping, min_damping, min_depth_ratio;
-    double min_depth, max_depth, log_focal, log_focal_information;
+    double min_depth, max_depth, log_focal_information;
 
     // The problem. Pixels and weights are (E, P, 2), in the order that they came in.
     const float* target_px;
@@ -86,6 +90,7 @@ struct Context {
     const float* median;          // of the inverse depths
     float* largest;               // (E) argument of the robust kernel, px^2
 
+    const double* prior_log_focal;  // (C)
     const double* prior_view;     // (V, 16)
     const double* prior_sigma;    // (V, 2) of place and rotation
 
@@ -106,8 +111,8 @@ struct Context {
     const int* edge_target;
     float* edge_transform;  // (2, E, 20) rows of [R | t] and the intrinsics (5) of the target, as the state
     double* edge_adjoint;   // (E, 36) where it was linearised last
-    float* edge_twist;      // (E, 8) of the proposed step, then those of log f and alpha
-    double* pose_step;      // (N, 6), then those of log f and alpha
+    float* edge_twist;      // (E, 10) of the proposed step, then log f and alpha of the source's camera and the target's
+    double* pose_step;      // (N, 6), then those of log f and alpha (C, 2)
 
     // Units: the edges of a frame whose depths are eliminated together, or some of a frame whose depths are held.
     const int* unit_frame;
@@ -115,7 +120,8 @@ struct Context {
     const int* unit_count;
     const int* unit_free;
     const i64* unit_partial;    // offset of its slices in `partial`
-    const i64* unit_direct;     // of its first block in `pool`: 3 per edge, then 3
+    const i64* unit_direct;     // of its first block in `pool`: (target, target), (target, source), (tail, target) of each
+                                // edge, then (source, source), (tail, source), (tail, tail)
     const i64* unit_eliminated; // likewise: the lower triangle over (source, targets, tail)
     float* partial;
     float* scratch;             // rows and products of units too large for shared memory
@@ -131,7 +137,7 @@ struct Context {
     const int* direct_entry;
     const int* eliminated_first;
     const int* eliminated_entry;
-    const int* diagonal_block;  // (nodes + 1)
+    const int* diagonal_block;  // (nodes)
     double* blocks;             // (2, blocks, 2, 36) direct and eliminated, as the system
 
     // Its factor in tiles, sorted by the level at which their column can be eliminated.
@@ -150,6 +156,7 @@ struct Context {
     double* diagonal_factor;    // (sides, 48, 48)
     double* scale;              // (48 sides)
     double* solution;           // (48 sides)
+    double* inverse;            // (2, intrinsics) columns of the inverse of the factor's last rows
 
     Control* control;
     double* report;             // as `answer.py` says
@@ -162,19 +169,30 @@ static_assert(sizeof(Control) <= CONTROL_BYTES, "the control does not fit");
 
 __device__ inline i64 triangle(i64 row, i64 column) { return row * (row + 1) / 2 + column; }
 
+// Free intrinsics of a camera, and rows that an edge has for them: where cameras are apart, those of its target's camera
+// come before those of its source's.
 __device__ inline int num_free(const Context& c) { return (int)(c.focal_free + c.alpha_free); }
+__device__ inline int num_own(const Context& c) { return num_free(c) * (c.apart ? 2 : 1); }
 
-// Scalars of an edge's 9x9 (8x8, 7x7) product that are kept, padded to what a warp writes at once.
-__device__ inline int product_stride(int intrinsics) { return intrinsics == 0 ? 32 : intrinsics == 1 ? 40 : 48; }
+// Scalars of an edge's product (twist, intrinsics, right-hand side) that are kept, padded to what a warp writes at once.
+__device__ constexpr int product_stride(int own) { return own == 0 ? 32 : own == 1 ? 40 : own == 2 ? 48 : 72; }
 
 // Floats that a unit leaves per slice: its products over pairs of slots, those of its edges, and two costs of priors.
-__device__ inline i64 partial_size(int count, int depth_free, int intrinsics) {
-    return (depth_free ? triangle(count + 1, 0) * 36 : 0) + (i64)count * product_stride(intrinsics) + 2;
+__device__ inline i64 partial_size(int count, int depth_free, int own, int tail) {
+    return (depth_free ? triangle(count + tail, 0) * 36 : 0) + (i64)count * product_stride(own) + 2;
 }
 
-__device__ inline double robust_cost(int kernel, double scale, double squared) {
+// `final` is the scale that graduated non-convexity ends at, see `vipe_core/ba/robust.py`.
+__device__ inline double robust_cost(int kernel, double scale, double final, double squared) {
     double c2 = scale * scale;
     switch (kernel) {
+        case TRUNCATED: {
+            const double f2 = final * final, wide = c2 - f2 > 1e-300 ? c2 - f2 : 1e-300;
+            if (squared * c2 <= f2 * f2) return squared;
+            double gap = scale - sqrt(squared);
+            gap = gap < 0 ? 0 : gap > wide / scale ? wide / scale : gap;
+            return f2 * (1 - gap * (gap / wide));
+        }
         case HUBER: return squared <= c2 ? squared : 2 * scale * sqrt(squared) - c2;
         case CAUCHY: return c2 * log1p(squared / c2);
         case TUKEY: {

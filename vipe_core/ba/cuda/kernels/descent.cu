@@ -23,7 +23,7 @@ __device__ inline void judge_at(const Context& c, Control& control, double measu
     control.lost = lost;
     control.prior = prior;
     // A lost measurement costs as much as a gross outlier, else losing them all would be best.
-    const double outlier = robust_cost((int)c.robust, control.scale_next, 100 * control.scale_next * control.scale_next);
+    const double scale = control.scale_next, outlier = robust_cost((int)c.robust, scale, c.robust_scale, 100 * scale * scale);
     const double mean = 4 * measured / weight;
     control.lost_rho = outlier > mean ? outlier : mean;
 }
@@ -71,7 +71,8 @@ extern "C" __global__ void begin(const Context c) {
     control.damping = c.initial_damping;
     control.initial_cost = control.measured = control.weight = control.lost = control.prior = control.predicted = 0;
     control.initial_weight = 0;
-    for (int k = 0; k < 4; ++k) control.covariance[k] = 0;
+    // Until `covariance` knows better.
+    for (int k = 0; k < 4 * c.num_cameras; ++k) c.report[REPORT_NUMBERS + k] = sqrt(-1.0);
     control.lost_rho = 0;
     control.scale_system = control.scale_judge = c.robust_scale;
     begin_at(c, control, c.first_scale);
@@ -120,14 +121,17 @@ extern "C" __global__ void __launch_bounds__(WIDE_THREADS) transform(const Conte
             linear[i] = r[3 * i] * a[0] + r[3 * i + 1] * a[1] + r[3 * i + 2] * a[2];
             angular[i] = r[3 * i] * a[3] + r[3 * i + 1] * a[4] + r[3 * i + 2] * a[5];
         }
-        float* twist = c.edge_twist + edge * 8;
+        float* twist = c.edge_twist + edge * TWIST_FLOATS;
         for (int i = 0; i < 3; ++i) {
             const int j = (i + 1) % 3, k = (i + 2) % 3;
             twist[i] = (float)(b[i] - linear[i] - (t[j] * angular[k] - t[k] * angular[j]));
             twist[3 + i] = (float)(b[3 + i] - angular[i]);
         }
-        twist[6] = (float)c.pose_step[c.num_frames * 6];
-        twist[7] = (float)c.pose_step[c.num_frames * 6 + 1];
+        const double* cameras = c.pose_step + c.num_frames * 6;
+        for (int k = 0; k < 2; ++k) {
+            twist[6 + k] = (float)cameras[2 * c.frame_camera[source] + k];
+            twist[8 + k] = (float)cameras[2 * c.frame_camera[target] + k];
+        }
     }
     float* out = c.edge_transform + (next * c.num_edges + edge) * EDGE_FLOATS;
     const double* camera = intrinsics_of(c, (int)next, (int)target);
@@ -175,8 +179,8 @@ extern "C" __global__ void __launch_bounds__(WIDE_THREADS) judge(const Context c
     if (control.done || control.mode == IDLE) return;
     const double measured = sums[0], next = sums[1], weight = sums[2], lost = sums[3] - sums[2];
     double prior = sums[4];
-    if (c.log_focal_information > 0) {
-        const double off = log(c.intrinsics[5 * linearised_state(control)]) - c.log_focal;
+    for (int camera = 0; camera < (c.log_focal_information > 0 ? c.num_cameras : 0); ++camera) {
+        const double off = log_focal_off(c, linearised_state(control), camera);
         prior += c.log_focal_information * off * off;
     }
     for (int view = 0; view < (c.has_view_prior ? c.num_views : 0); ++view) {
@@ -273,31 +277,31 @@ __device__ inline void node_step(const Context& c, int node, double* twist) {
 
 // propose: one block of threads. Whether the solution is worth a try, and the poses and intrinsics it leads to.
 extern "C" __global__ void __launch_bounds__(WIDE_THREADS) propose(const Context c) {
-    __shared__ double shared[WIDE_THREADS], intrinsic_step[2];
+    __shared__ double shared[WIDE_THREADS];
     __shared__ int tried;
     Control& control = *c.control;
-    const int thread = threadIdx.x, intrinsics = num_free(c);
+    const int thread = threadIdx.x, each = num_free(c), right = (int)c.num_intrinsics;
     if (control.done || !control.solve) return;
     const double* blocks = c.blocks + control.system * c.num_blocks * 72;
     const double* now = c.intrinsics + 5 * c.num_cameras * control.state;
     const double shrink = 1 / (1 + control.damping);
-    const i64 tail = 6 * c.num_nodes;
+    double* intrinsic_step = c.pose_step + c.num_frames * 6;
     const bool factorised = control.factorised != 0;
     // Everybody has read the control before anybody writes it.
     __syncthreads();
-    if (thread == 0) {
-        int k = 0;
-        intrinsic_step[0] = intrinsic_step[1] = 0;
-        tried = 0;
+    if (thread == 0) tried = 0;
+    for (i64 camera = thread; camera < c.num_cameras; camera += WIDE_THREADS) {
+        const i64 at = 6 * c.num_nodes + camera * each, of_alpha = at + c.focal_free;
+        double* step = intrinsic_step + 2 * camera;
+        step[0] = step[1] = 0;
         if (factorised && c.focal_free) {
-            const double step = c.solution[tail + k] * c.scale[tail + k];
-            intrinsic_step[0] = step > MAX_LOG_FOCAL_STEP ? MAX_LOG_FOCAL_STEP
-                                : step < -MAX_LOG_FOCAL_STEP ? -MAX_LOG_FOCAL_STEP : step;
-            ++k;
+            const double wanted = c.solution[at] * c.scale[at];
+            step[0] = wanted > MAX_LOG_FOCAL_STEP ? MAX_LOG_FOCAL_STEP
+                      : wanted < -MAX_LOG_FOCAL_STEP ? -MAX_LOG_FOCAL_STEP : wanted;
         }
         if (factorised && c.alpha_free) {
-            const double alpha = now[4] + c.solution[tail + k] * c.scale[tail + k];
-            intrinsic_step[1] = (alpha > MAX_ALPHA ? MAX_ALPHA : alpha < 0 ? 0 : alpha) - now[4];
+            const double old = now[5 * camera + 4], alpha = old + c.solution[of_alpha] * c.scale[of_alpha];
+            step[1] = (alpha > MAX_ALPHA ? MAX_ALPHA : alpha < MIN_ALPHA ? MIN_ALPHA : alpha) - old;
         }
     }
     __syncthreads();
@@ -305,17 +309,20 @@ extern "C" __global__ void __launch_bounds__(WIDE_THREADS) propose(const Context
     double predicted[1] = {0};
     if (factorised)
         for (i64 block = thread; block < c.num_blocks; block += WIDE_THREADS) {
-            if (c.block_row[block] != c.num_nodes) continue;
+            if (c.block_row[block] != c.num_nodes + right / 6) continue;
             const i64 column = c.block_column[block];
-            const double* entry = blocks + block * 72 + intrinsics * 6;
+            const double* entry = blocks + block * 72 + right % 6 * 6;
             if (column < c.num_nodes) {
                 for (int k = 0; k < 6; ++k)
                     predicted[0] += (entry[k] - shrink * entry[36 + k]) * c.solution[column * 6 + k] *
                                     c.scale[column * 6 + k];
             } else {
-                for (int k = 0; k < intrinsics; ++k)
-                    predicted[0] += (entry[k] - shrink * entry[36 + k]) * intrinsic_step[c.focal_free ? k : 1];
-                predicted[0] += shrink * entry[36 + intrinsics];
+                const int first = (int)(column - c.num_nodes) * 6, left = right - first, count = left < 6 ? left : 6;
+                for (int k = 0; k < count; ++k) {
+                    const int camera = (first + k) / each, which = c.focal_free ? (first + k) % each : 1;
+                    predicted[0] += (entry[k] - shrink * entry[36 + k]) * intrinsic_step[2 * camera + which];
+                }
+                if (left < 6) predicted[0] += shrink * entry[36 + left];
             }
         }
     sum_threads(predicted, shared);
@@ -340,13 +347,11 @@ extern "C" __global__ void __launch_bounds__(WIDE_THREADS) propose(const Context
     }
     __syncthreads();
     if (!tried) return;
-    // Of several cameras nothing is free, and both buffers hold them.
     double* next = c.intrinsics + 5 * c.num_cameras * (1 - control.state);
-    if (thread < 5)
-        next[thread] = thread < 2 && c.focal_free ? now[thread] * exp(intrinsic_step[0])
-                       : thread == 4              ? now[4] + intrinsic_step[1]
-                                                  : now[thread];
-    if (thread < 2) c.pose_step[c.num_frames * 6 + thread] = intrinsic_step[thread];
+    for (i64 k = thread; k < 5 * c.num_cameras; k += WIDE_THREADS) {
+        const double* step = intrinsic_step + k / 5 * 2;
+        next[k] = k % 5 < 2 && c.focal_free ? now[k] * exp(step[0]) : k % 5 == 4 ? now[k] + step[1] : now[k];
+    }
     const double* views = c.view + control.state * c.num_views * 16;
     for (i64 view = thread; view < c.num_views; view += WIDE_THREADS) {
         double twist[6];
@@ -378,31 +383,48 @@ extern "C" __global__ void __launch_bounds__(WIDE_THREADS) propose(const Context
     }
 }
 
-// covariance: one thread. The intrinsics are eliminated last, so the last of the factor is all it takes.
+// Entry of the factor among the columns of the tail, row >= column.
+__device__ inline double tail_factor(const Context& c, int row, int column) {
+    const i64 i = 6 * c.num_nodes + row, j = 6 * c.num_nodes + column;
+    const i64 at = i % SIDE * SIDE + j % SIDE, above = i / SIDE, side = j / SIDE;
+    if (above == side) return c.diagonal_factor[side * SIDE * SIDE + at];
+    int k = c.column_first[side];
+    while (c.tile_row[c.column_tile[k]] != above) ++k;
+    return c.factor[(i64)c.column_tile[k] * SIDE * SIDE + at];
+}
+
+// covariance: one thread. The intrinsics are eliminated last, so the last of the factor is all it takes: of L L^T, the
+// inverse is M^T M with M = L^-1, and columns of M are zero above their diagonal. Each camera has the first attempt that
+// says something of it.
 extern "C" __global__ void covariance(const Context c, int attempt) {
     Control& control = *c.control;
     if (nothing_to_factorise(control, attempt)) return;
     const bool factorised = control.factorised != 0;
-    control.factorised = 1;
-    const int intrinsics = num_free(c), at = (int)(c.num_nodes % SIDE_BLOCKS) * 6;
-    const i64 side = c.num_nodes / SIDE_BLOCKS;
-    const double* factor = c.diagonal_factor + side * SIDE * SIDE + at * SIDE + at;
+    control.factorised = control.covariance_found = 1;
+    const int each = num_free(c), unknowns = (int)c.num_intrinsics, cameras = unknowns / each;
     const double* scale = c.scale + 6 * c.num_nodes;
-    double found[4] = {0, 0, 0, 0};
-    const double a = 1 / factor[0];
-    if (intrinsics == 1) {
-        found[c.focal_free ? 0 : 3] = a * a * scale[0] * scale[0];
-    } else {
-        // Inverse of L L^T for L = [p 0; q r]: with M = L^-1, M^T M.
-        const double d = 1 / factor[SIDE + 1], b = -factor[SIDE] * a * d;
-        found[0] = (a * a + b * b) * scale[0] * scale[0];
-        found[1] = found[2] = b * d * scale[0] * scale[1];
-        found[3] = d * d * scale[1] * scale[1];
-    }
-    const bool sound = factorised && (!c.focal_free || found[0] > 0) && (!c.alpha_free || found[3] > 0);
-    if (sound) {
-        for (int k = 0; k < 4; ++k) control.covariance[k] = found[k];
-        control.covariance_found = 1;
+    for (int camera = 0; camera < cameras; ++camera) {
+        double* out = c.report + REPORT_NUMBERS + 4 * camera;
+        if (out[0] == out[0]) continue;
+        double found[2][2] = {{0, 0}, {0, 0}};
+        bool sound = factorised;
+        for (int k = 0; k < (sound ? each : 0); ++k) {
+            double* column = c.inverse + k * unknowns;
+            for (int row = camera * each; row < unknowns; ++row) {
+                double sum = row == camera * each + k ? 1 : 0;
+                for (int q = camera * each; q < row; ++q) sum -= tail_factor(c, row, q) * column[q];
+                column[row] = sum / tail_factor(c, row, row);
+            }
+            for (int j = 0; j <= k; ++j) {
+                double sum = 0;
+                for (int row = camera * each; row < unknowns; ++row) sum += column[row] * c.inverse[j * unknowns + row];
+                found[k][j] = found[j][k] = sum * scale[camera * each + k] * scale[camera * each + j];
+            }
+            sound = found[k][k] > 0;
+        }
+        if (!sound) control.covariance_found = 0;
+        else if (each == 2) out[0] = found[0][0], out[1] = out[2] = found[0][1], out[3] = found[1][1];
+        else out[0] = c.focal_free ? found[0][0] : 0, out[1] = out[2] = 0, out[3] = c.focal_free ? 0 : found[0][0];
     }
 }
 
@@ -419,14 +441,13 @@ extern "C" __global__ void __launch_bounds__(WIDE_THREADS) finish(const Context 
     }
     if (thread) return;
     const double nan = sqrt(-1.0);
-    const bool solved = control.status != NON_FINITE && control.status != EMPTY;
+    // Of what is held, and where nothing was solved, there is nothing to be unsure of.
+    if (control.status == NON_FINITE || control.status == EMPTY || !num_free(c))
+        for (int k = 0; k < 4 * c.num_cameras; ++k) c.report[REPORT_NUMBERS + k] = 0;
     c.report[0] = (double)((control.status == RUNNING ? MAX_ITERATIONS : control.status) - CONVERGED);
     c.report[1] = (double)control.iterations;
     // Of a state that is not finite there is no cost.
     c.report[2] = *c.finite ? control.initial_cost : nan;
     c.report[3] = *c.finite ? control.measured : nan;
     c.report[4] = *c.finite ? control.weight : 0.0;
-    const bool unknown = solved && num_free(c) && !control.covariance_found;
-    for (int k = 0; k < 4 * c.num_cameras; ++k)
-        c.report[5 + k] = unknown ? nan : c.num_cameras == 1 ? control.covariance[k] : 0.0;
 }

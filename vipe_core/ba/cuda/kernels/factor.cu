@@ -23,7 +23,7 @@ extern "C" __global__ void __launch_bounds__(FACTOR_THREADS) damp(const Context 
     __shared__ double row_scale[SIDE], column_scale[SIDE];
     const int thread = threadIdx.x, tile = blockIdx.x, row_side = c.tile_row[tile], column_side = c.tile_column[tile];
     const double damping = damping_of(control, covariance), shrink = 1 / (1 + damping);
-    const int columns = (int)(6 * c.num_nodes) + num_free(c);
+    const int columns = (int)(6 * c.num_nodes + c.num_intrinsics);
     const double* blocks = c.blocks + control.system * c.num_blocks * 72;
     double* out = c.factor + (i64)tile * SIDE * SIDE;
     for (int k = thread; k < SIDE * SIDE; k += FACTOR_THREADS) out[k] = 0;
@@ -94,7 +94,7 @@ extern "C" __global__ void __launch_bounds__(FACTOR_THREADS) factorise(const Con
     const int thread = threadIdx.x, tile = first_tile + blockIdx.x, side = c.tile_column[tile];
     const bool diagonal = c.tile_row[tile] == side;
     const int rows = diagonal ? SIDE : 2 * SIDE;
-    const int left = (int)(6 * c.num_nodes) + num_free(c) - side * SIDE, columns = left < SIDE ? left : SIDE;
+    const int left = (int)(6 * c.num_nodes + c.num_intrinsics) - side * SIDE, columns = left < SIDE ? left : SIDE;
     const double* upper = c.factor + (i64)c.column_diagonal[side] * SIDE * SIDE;
     double* lower = c.factor + (i64)tile * SIDE * SIDE;
     for (int e = thread; e < SIDE * SIDE; e += FACTOR_THREADS) {
@@ -128,7 +128,7 @@ extern "C" __global__ void __launch_bounds__(FACTOR_THREADS) substitute(const Co
     __shared__ double sums[FACTOR_THREADS / SIDE][SIDE], rest[SIDE], found[SIDE];
     const int thread = threadIdx.x, side = c.level_column[first_column + blockIdx.x];
     const int group = thread / SIDE, column = thread % SIDE;
-    const int total = (int)(6 * c.num_nodes) + num_free(c), left = total - side * SIDE;
+    const int total = (int)(6 * c.num_nodes + c.num_intrinsics), left = total - side * SIDE;
     const int columns = left < SIDE ? left : SIDE, last = total / SIDE, right = total % SIDE;
     const double* diagonal = c.diagonal_factor + (i64)side * SIDE * SIDE;
     if (group < groups) {

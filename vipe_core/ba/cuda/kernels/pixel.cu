@@ -110,22 +110,50 @@ __device__ inline View see(const Camera& camera, const float* transform, const f
     return view;
 }
 
+// A robust kernel: its scale, and the square of the one that graduated non-convexity ends at.
+struct Scale {
+    float c, c2, final2;
+};
+
+__device__ inline Scale scale_from(double c, double final) {
+    return Scale{(float)c, (float)c * (float)c, (float)final * (float)final};
+}
+
+// Of the truncated kernel: where its slope falls from one to zero, how far below its end s is, over how much.
+struct Truncation {
+    bool inlier;
+    float root, gap, wide;
+};
+
+__device__ inline Truncation truncation(const Scale& scale, float s) {
+    Truncation at{s * scale.c2 <= scale.final2 * scale.final2, sqrtf(s), 0.0f, scale.c2 - scale.final2};
+    at.wide = at.wide > TINY ? at.wide : TINY;
+    const float most = at.wide / scale.c, gap = scale.c - at.root;
+    at.gap = gap > 0.0f ? (gap > most ? most : gap) : at.root - at.root;  // not a number where s is not finite
+    return at;
+}
+
 template <int ROBUST>
-__device__ inline float rho(float scale, float c2, float s) {
-    if constexpr (ROBUST == HUBER) return s > c2 ? 2.0f * scale * sqrtf(s) - c2 : s;
+__device__ inline float rho(const Scale& scale, float s) {
+    const float c2 = scale.c2;
+    if constexpr (ROBUST == HUBER) return s > c2 ? 2.0f * scale.c * sqrtf(s) - c2 : s;
     if constexpr (ROBUST == CAUCHY) return c2 * log1pf(s / c2);
     if constexpr (ROBUST == GEMAN_MCCLURE) return s * c2 / (c2 + s);
     if constexpr (ROBUST == TUKEY) {
-        float inside = 1.0f - s / c2;
-        inside = inside < 0.0f ? 0.0f : inside;
+        const float inside = s < c2 ? 1.0f - s / c2 : s - s;  // not a number where s is not finite
         return c2 / 3.0f * (1.0f - inside * inside * inside);
+    }
+    if constexpr (ROBUST == TRUNCATED) {
+        const Truncation at = truncation(scale, s);
+        return at.inlier ? s : scale.final2 * (1.0f - at.gap * (at.gap / at.wide));
     }
     return s;
 }
 
 // Scale residuals and roots of weights by sqrt(rho'(s)).
 template <int ROBUST>
-__device__ inline void reweigh(float c2, View& view) {
+__device__ inline void reweigh(const Scale& scale, View& view) {
+    const float c2 = scale.c2;
     float root;
     if constexpr (ROBUST == NONE) return;
     if constexpr (ROBUST == HUBER) root = sqrtf(sqrtf(c2 / (view.squared > c2 ? view.squared : c2)));
@@ -134,6 +162,10 @@ __device__ inline void reweigh(float c2, View& view) {
     if constexpr (ROBUST == TUKEY) {
         root = 1.0f - view.squared / c2;
         root = root < 0.0f ? 0.0f : root;
+    }
+    if constexpr (ROBUST == TRUNCATED) {
+        const Truncation at = truncation(scale, view.squared);
+        root = at.inlier ? 1.0f : sqrtf(scale.final2 * (at.gap / at.wide) / at.root);
     }
     view.eu *= root;
     view.ev *= root;

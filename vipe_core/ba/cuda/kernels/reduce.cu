@@ -14,16 +14,31 @@ __device__ inline double adjoint(const double* pose, int row, int column) {
     return pose[4 * j + 3] * pose[4 * k + q] - pose[4 * k + 3] * pose[4 * j + q];
 }
 
+// Rows of an edge's product that say something of a column of the tail, -1 for none: one, or of cameras that are apart
+// up to two, those of its target and of its source.
+struct OwnRows {
+    int row[2];
+};
+
+__device__ inline OwnRows own_rows(const Context& c, int source_camera, int target_camera, int column) {
+    const int free = num_free(c), last = SIX + num_own(c), unknowns = (int)c.num_intrinsics;
+    if (column >= unknowns) return OwnRows{{column == unknowns ? last : -1, -1}};
+    if (!c.apart) return OwnRows{{SIX + column, -1}};
+    const int camera = column / free, k = column % free;
+    return OwnRows{{camera == target_camera ? SIX + k : -1, camera == source_camera ? SIX + free + k : -1}};
+}
+
 // fold: one block of threads per unit.
 extern "C" __global__ void __launch_bounds__(WIDE_THREADS) fold(const Context c) {
     const Control& control = *c.control;
     if (control.done || control.mode == IDLE) return;
-    const int thread = threadIdx.x, unit = blockIdx.x, intrinsics = num_free(c), right = SIX + intrinsics;
+    const int thread = threadIdx.x, unit = blockIdx.x, own = num_own(c), right = SIX + own, tail = (int)c.num_tail;
     const int first = c.unit_first[unit], count = c.unit_count[unit], depth_free = c.unit_free[unit];
-    const int products = right * (right + 1) / 2 + right, stride = product_stride(intrinsics);
-    const i64 size = partial_size(count, depth_free, intrinsics), slices = c.num_slices;
+    const int products = right * (right + 1) / 2 + right, stride = product_stride(own);
+    const int pairs = depth_free ? (int)triangle(count + tail, 0) : 0, source_camera = c.frame_camera[c.unit_frame[unit]];
+    const i64 size = partial_size(count, depth_free, own, tail), slices = c.num_slices;
     const float* partial = c.partial + c.unit_partial[unit];
-    const float* edges = partial + (depth_free ? triangle(count + 1, 0) * 36 : 0);
+    const float* edges = partial + (i64)pairs * 36;
     const float* priors = edges + (i64)count * stride;
     const double* twists = c.edge_adjoint + (i64)first * 36;
     double* direct = c.pool + c.unit_direct[unit] * 36;
@@ -31,22 +46,26 @@ extern "C" __global__ void __launch_bounds__(WIDE_THREADS) fold(const Context c)
 
     // Twists among themselves, and with the tail. Slot k of the slices is slot k + 1 here: the source comes first.
     const int lanes = WIDE_THREADS / 36, value = thread % 36;
-    if (depth_free && thread < lanes * 36)
-        for (int k = thread / 36, i = 0, j = k; k < (int)triangle(count + 1, 0); k += lanes, j += lanes) {
+    if (thread < lanes * 36)
+        for (int k = thread / 36, i = 0, j = k; k < pairs; k += lanes, j += lanes) {
             while (j > i) j -= ++i;
             double sum = 0;
             for (i64 s = 0; s < slices; ++s) sum += (double)partial[s * size + (i64)k * 36 + value];
             eliminated[triangle(i + 1, j + 1) * 36 + value] = sum;
         }
-    for (int k = thread; k < count * 72; k += WIDE_THREADS) {
-        const int m = k / 72, tail = k % 72 / 36, row = k % 36 / 6, column = k % 6;
+    for (int k = thread; k < count * (1 + tail) * 36; k += WIDE_THREADS) {
+        const int m = k / 36 / (1 + tail), which = k / 36 % (1 + tail), row = k % 36 / 6, column = k % 6;
+        OwnRows rows{{row, -1}};
+        if (which) rows = own_rows(c, source_camera, c.frame_camera[c.edge_target[first + m]], 6 * which - 6 + row);
         double sum = 0;
-        if (tail == 0 || row <= intrinsics) {
-            const int r = tail ? SIX + row : row > column ? row : column, q = tail || row > column ? column : row;
+#pragma unroll
+        for (int i = 0; i < 2; ++i) {
+            const int r = rows.row[i] > column ? rows.row[i] : column, q = rows.row[i] > column ? column : rows.row[i];
+            if (q < 0) continue;
             const i64 at = (i64)m * stride + triangle(r, q);
             for (i64 s = 0; s < slices; ++s) sum += (double)edges[s * size + at];
         }
-        direct[(3 * m + (tail ? 2 : 0)) * 36 + row * 6 + column] = sum;
+        direct[((2 + tail) * m + (which ? 1 + which : 0)) * 36 + row * 6 + column] = sum;
     }
     // Costs, a warp each: to judge, at the next scale, weight, all weight, prior.
     const int warp = thread / 32, lane = thread % 32;
@@ -60,31 +79,43 @@ extern "C" __global__ void __launch_bounds__(WIDE_THREADS) fold(const Context c)
         if (lane == 0) c.unit_sums[(i64)unit * 5 + warp] = sum;
     }
     // The tail with itself: intrinsics, and intrinsics with the right-hand side.
-    double* corner = direct + (3 * count + 2) * 36;
-    if (thread < 36) {
-        const int row = thread / 6, column = thread % 6;
-        const int r = row > column ? row : column, q = row > column ? column : row;
+    double* of_source = direct + (2 + tail) * count * 36;
+    for (int k = thread; k < (int)triangle(tail, 0) * 36; k += WIDE_THREADS) {
+        int i = 0, j = k / 36;
+        while (j > i) j -= ++i;
+        const int row = 6 * i + k % 36 / 6, column = 6 * j + k % 6;
         double sum = 0;
-        if (r <= intrinsics && q < intrinsics)
-            for (int m = 0; m < count; ++m)
+        for (int m = 0; m < count; ++m) {
+            const int target_camera = c.frame_camera[c.edge_target[first + m]];
+            const OwnRows rows = own_rows(c, source_camera, target_camera, row);
+            const OwnRows columns = own_rows(c, source_camera, target_camera, column);
+#pragma unroll
+            for (int pair = 0; pair < 4; ++pair) {
+                const int a = rows.row[pair / 2], b = columns.row[pair % 2], r = a > b ? a : b, q = a > b ? b : a;
+                // The right-hand side with itself is not kept.
+                if (q < 0 || q == right) continue;
                 for (i64 s = 0; s < slices; ++s)
-                    sum += (double)edges[s * size + (i64)m * stride + triangle(SIX + r, SIX + q)];
-        corner[thread] = sum;
+                    sum += (double)edges[s * size + (i64)m * stride + triangle(r, q)];
+            }
+        }
+        of_source[(1 + tail) * 36 + k] = sum;
     }
     __syncthreads();
 
     // Columns of the source: minus the sum over the edges of their columns times Ad.
-    for (int k = thread; k < (count + 1) * 36; k += WIDE_THREADS) {
+    for (int k = thread; k < (count + tail) * 36; k += WIDE_THREADS) {
         const int a = k / 36, row = k % 36 / 6, column = k % 6;
         double sum = 0;
         if (a < count) {
-            for (int q = 0; q < 6; ++q) sum -= direct[3 * a * 36 + row * 6 + q] * twists[a * 36 + q * 6 + column];
-            direct[(3 * a + 1) * 36 + row * 6 + column] = sum;
+            const double* block = direct + (2 + tail) * a * 36;
+            for (int q = 0; q < 6; ++q) sum -= block[row * 6 + q] * twists[a * 36 + q * 6 + column];
+            direct[((2 + tail) * a + 1) * 36 + row * 6 + column] = sum;
         } else {
-            for (int m = 0; m < count; ++m)
-                for (int q = 0; q < 6; ++q)
-                    sum -= direct[(3 * m + 2) * 36 + row * 6 + q] * twists[m * 36 + q * 6 + column];
-            direct[(3 * count + 1) * 36 + row * 6 + column] = sum;
+            for (int m = 0; m < count; ++m) {
+                const double* block = direct + ((2 + tail) * m + 2 + a - count) * 36;
+                for (int q = 0; q < 6; ++q) sum -= block[row * 6 + q] * twists[m * 36 + q * 6 + column];
+            }
+            of_source[(1 + a - count) * 36 + row * 6 + column] = sum;
         }
         if (!depth_free) continue;
         sum = 0;
@@ -101,10 +132,10 @@ extern "C" __global__ void __launch_bounds__(WIDE_THREADS) fold(const Context c)
         if (kind == 1 && !depth_free) return;
         double sum = 0;
         for (int m = 0; m < count; ++m) {
-            const double* block = kind ? eliminated + triangle(m + 1, 0) * 36 : direct + (3 * m + 1) * 36;
+            const double* block = kind ? eliminated + triangle(m + 1, 0) * 36 : direct + ((2 + tail) * m + 1) * 36;
             for (int q = 0; q < 6; ++q) sum -= twists[m * 36 + q * 6 + row] * block[q * 6 + column];
         }
-        (kind ? eliminated : direct + 3 * count * 36)[row * 6 + column] = sum;
+        (kind ? eliminated : of_source)[row * 6 + column] = sum;
     }
 }
 
@@ -174,6 +205,11 @@ __device__ inline void view_prior(const Context& c, i64 state, int view, double*
     }
 }
 
+// By how much the prior of a camera's log f is more than it.
+__device__ inline double log_focal_off(const Context& c, i64 state, int camera) {
+    return c.prior_log_focal[camera] - log(c.intrinsics[5 * (state * c.num_cameras + camera)]);
+}
+
 // assemble: seven blocks of the system per block of threads, 36 threads each.
 extern "C" __global__ void __launch_bounds__(WIDE_THREADS) assemble(const Context c) {
     const Control& control = *c.control;
@@ -191,16 +227,18 @@ extern "C" __global__ void __launch_bounds__(WIDE_THREADS) assemble(const Contex
         const int entry = c.eliminated_entry[k];
         eliminated += c.pool[(i64)(entry / 2) * 36 + (entry % 2 ? flipped : value)];
     }
-    if (c.log_focal_information > 0 && c.block_row[block] == c.num_nodes && c.block_column[block] == c.num_nodes) {
-        const int right = num_free(c);
-        const double off = c.log_focal - log(c.intrinsics[5 * linearised_state(control)]);
-        if (value == 0) direct += c.log_focal_information;
-        if (value == right || value == right * 6) direct += c.log_focal_information * off;
+    if (c.log_focal_information > 0 && c.block_column[block] >= c.num_nodes) {
+        const int each = num_free(c), right = (int)c.num_intrinsics;
+        const int i = (int)(c.block_row[block] - c.num_nodes) * 6 + row;
+        const int j = (int)(c.block_column[block] - c.num_nodes) * 6 + column, least = i < j ? i : j;
+        // The first of a camera's intrinsics, with itself or with the right-hand side.
+        if (least < right && least % each == 0 && (i == j || i == right || j == right))
+            direct += c.log_focal_information * (i == j ? 1 : log_focal_off(c, linearised_state(control), least / each));
     }
     if (c.has_view_prior && c.block_column[block] < c.num_nodes) {
         const int view = c.node_view[c.block_column[block]];
         const bool diagonal = c.block_row[block] == c.block_column[block];
-        if (view >= 0 && (diagonal || (c.block_row[block] == c.num_nodes && row == num_free(c)))) {
+        if (view >= 0 && (diagonal || (c.block_row[block] - c.num_nodes) * 6 + row == c.num_intrinsics)) {
             double residual[6], jacobian[6][6];
             view_prior(c, linearised_state(control), view, residual, jacobian);
             for (int k = 0; k < 6; ++k) direct += jacobian[k][column] * (diagonal ? jacobian[k][row] : -residual[k]);

@@ -11,8 +11,8 @@
 // Numbers a unit of `count` edges needs for the rows and the products of a tile.
 struct TileLayout {
     int slots, pairs, groups, stride, items;
-    __device__ TileLayout(int count, int depth_free) {
-        slots = depth_free ? count + 1 : 0;
+    __device__ TileLayout(int count, int depth_free, int tail) {
+        slots = depth_free ? count + tail : 0;
         pairs = slots * (slots + 1) / 2;
         // Several threads share a pair where there are few: a power of two, at most one per four cells.
         groups = 1;
@@ -77,12 +77,14 @@ __device__ inline void multiply(const float* rows, const TileLayout& at, int ite
     for (int k = 0; k < 36; ++k) products[k * at.items + item] += sum[k];
 }
 
-// LARGE units keep rows and products in `scratch`: slower, with the same bits.
-template <bool UNIFIED, bool FOCAL, bool ALPHA, int ROBUST, bool LARGE>
+// LARGE units keep rows and products in `scratch`: slower, with the same bits. Where cameras are APART, an edge has rows
+// for the intrinsics of its target's camera, then of its source's; with the depths, those of the same camera are summed.
+template <bool UNIFIED, bool FOCAL, bool ALPHA, bool APART, int ROBUST, bool LARGE>
 __device__ inline void tile_pass(const Context& c, int first_unit, float* shared) {
-    constexpr int INTRINSICS = FOCAL + ALPHA, TWIST = 6, RIGHT = TWIST + INTRINSICS;
+    constexpr int INTRINSICS = FOCAL + ALPHA, TWIST = 6, SOURCE = TWIST + (APART ? INTRINSICS : 0);
+    constexpr int RIGHT = SOURCE + INTRINSICS;
     constexpr int PRODUCTS = RIGHT * (RIGHT + 1) / 2 + RIGHT;  // lower triangle without its last corner
-    constexpr int STRIDE = INTRINSICS == 0 ? 32 : INTRINSICS == 1 ? 40 : 48;
+    constexpr int STRIDE = product_stride(RIGHT - TWIST);
     const Control& control = *c.control;
     if (control.done || control.mode == IDLE) return;
     const bool step = control.mode == STEP;
@@ -92,7 +94,8 @@ __device__ inline void tile_pass(const Context& c, int first_unit, float* shared
     const i64 slice = blockIdx.x % c.num_slices;
     const int frame = c.unit_frame[unit], first = c.unit_first[unit], count = c.unit_count[unit];
     const int depth_free = c.unit_free[unit];
-    const TileLayout at(count, depth_free);
+    const int tail_nodes = APART ? (int)c.num_tail : 1, unknowns = APART ? (int)c.num_intrinsics : INTRINSICS;
+    const TileLayout at(count, depth_free, tail_nodes);
 
     double* cameras = (double*)shared;  // (2, 5) intrinsics of the frame before and after the step
     float* rays = shared + 20;
@@ -104,17 +107,18 @@ __device__ inline void tile_pass(const Context& c, int first_unit, float* shared
         rows = c.scratch + (i64)blockIdx.x * c.scratch_stride;
     float* products = rows + at.rows();
     float* edges = products + at.products();  // (count, STRIDE)
+    // (warps, intrinsics of all cameras, TILE) where cameras are apart
+    float* by_camera = edges + (i64)count * STRIDE + (i64)warp * unknowns * TILE;
     for (i64 k = thread; k < at.products() + (i64)count * STRIDE; k += TILE_THREADS) products[k] = 0.0f;
 
     if (thread < 5) {
         cameras[thread] = intrinsics_of(c, (int)now, frame)[thread];
         cameras[5 + thread] = intrinsics_of(c, (int)next, frame)[thread];
     }
-    const float scale_now = (float)control.scale_system;
-    const float scale_judge = (float)control.scale_judge, scale_next = (float)control.scale_next;
-    const float c2_now = scale_now * scale_now, c2_judge = scale_judge * scale_judge;
-    const float c2_next = scale_next * scale_next;
-    const bool one_scale = scale_judge == scale_next;
+    const Scale scale_now = scale_from(control.scale_system, c.robust_scale);
+    const Scale scale_judge = scale_from(control.scale_judge, c.robust_scale);
+    const Scale scale_next = scale_from(control.scale_next, c.robust_scale);
+    const bool one_scale = scale_judge.c == scale_next.c;
     const float grown = 1.0f + (float)control.damping;
     float prior_cost = 0.0f;
 
@@ -142,7 +146,7 @@ __device__ inline void tile_pass(const Context& c, int first_unit, float* shared
                 const i64 edge = first + m, row = (i64)c.edge_id[edge] * P;
                 const float* transform = c.edge_transform + (now * c.num_edges + edge) * EDGE_FLOATS;
                 const Camera before = camera_of(transform);
-                const float* twist = c.edge_twist + edge * 8;
+                const float* twist = c.edge_twist + edge * TWIST_FLOATS;
 #pragma unroll
                 for (int h = 0; h < 2; ++h) {
                     const int p = lane + 32 * h;
@@ -151,7 +155,7 @@ __device__ inline void tile_pass(const Context& c, int first_unit, float* shared
                     View view = see<UNIFIED, FOCAL, ALPHA>(before, transform, rays, p, depths[p],
                                                            ((const float2*)c.target_px)[at_cell],
                                                            ((const float2*)c.weight)[at_cell], inside);
-                    reweigh<ROBUST>(c2_now, view);
+                    reweigh<ROBUST>(scale_now, view);
                     const ByPoint j = by_point<UNIFIED>(before, view);
                     const float2 d = push<UNIFIED>(j, view, transform[3], transform[7], transform[11]);
                     float x = twist[0] * depths[p] + twist[4] * view.z - twist[5] * view.y;
@@ -164,7 +168,7 @@ __device__ inline void tile_pass(const Context& c, int first_unit, float* shared
                         x += twist[6] * a;
                         y += twist[6] * b;
                         z += twist[6] * e;
-                        share += twist[6];
+                        share += twist[8];
                     }
                     if constexpr (ALPHA) {
                         float a, b, e;
@@ -172,7 +176,7 @@ __device__ inline void tile_pass(const Context& c, int first_unit, float* shared
                         x += twist[7] * a;
                         y += twist[7] * b;
                         z += twist[7] * e;
-                        share -= twist[7] * view.norm * view.inverse;
+                        share -= twist[9] * view.norm * view.inverse;
                     }
                     float2 moved = push<UNIFIED>(j, view, x, y, z);
                     // Both camera derivatives are multiples of f (px, py).
@@ -211,10 +215,14 @@ __device__ inline void tile_pass(const Context& c, int first_unit, float* shared
         for (int h = 0; h < 2; ++h)
 #pragma unroll
             for (int k = 0; k < INTRINSICS + 2; ++k) tail[h][k] = 0.0f;
+        if (APART && depth_free)
+            for (int k = lane; k < unknowns * TILE; k += 32) by_camera[k] = 0.0f;
         for (int m = warp; m < count; m += TILE_WARPS) {
             const i64 edge = first + m, row = (i64)c.edge_id[edge] * P;
             const float* transform = c.edge_transform + (next * c.num_edges + edge) * EDGE_FLOATS;
             const Camera camera = camera_of(transform);
+            float* of_target = by_camera;
+            if constexpr (APART) of_target += c.frame_camera[c.edge_target[edge]] * INTRINSICS * TILE;
             float sums[STRIDE];
 #pragma unroll
             for (int k = 0; k < STRIDE; ++k) sums[k] = 0.0f;
@@ -226,13 +234,12 @@ __device__ inline void tile_pass(const Context& c, int first_unit, float* shared
                 View view = see<UNIFIED, FOCAL, ALPHA>(camera, transform, rays, p, depths[p],
                                                        ((const float2*)c.target_px)[at_cell],
                                                        ((const float2*)c.weight)[at_cell], inside);
-                const float cost = view.weight * rho<ROBUST>(scale_judge, c2_judge, view.squared);
+                const float cost = view.weight * rho<ROBUST>(scale_judge, view.squared);
                 sums[PRODUCTS] += cost;
-                sums[PRODUCTS + 1] +=
-                    one_scale ? cost : view.weight * rho<ROBUST>(scale_next, c2_next, view.squared);
+                sums[PRODUCTS + 1] += one_scale ? cost : view.weight * rho<ROBUST>(scale_next, view.squared);
                 sums[PRODUCTS + 2] += view.weight;
                 sums[PRODUCTS + 3] += view.all_weight;
-                reweigh<ROBUST>(c2_next, view);
+                reweigh<ROBUST>(scale_next, view);
 
                 const ByPoint j = by_point<UNIFIED>(camera, view);
                 const float au = j.gu * view.px, av = j.gv * view.py, d = depths[p];
@@ -254,15 +261,22 @@ __device__ inline void tile_pass(const Context& c, int first_unit, float* shared
                 if constexpr (FOCAL) {
                     float a, b, e;
                     ray_change<UNIFIED, FOCAL, ALPHA, false>(transform, rays, p, a, b, e);
-                    u[TWIST] = u0 * a + u1 * b + u2 * e + view.su * camera.fx * view.px;
-                    v[TWIST] = v0 * a + v1 * b + v2 * e + view.sv * camera.fy * view.py;
+                    u[SOURCE] = u0 * a + u1 * b + u2 * e;
+                    v[SOURCE] = v0 * a + v1 * b + v2 * e;
+                    const float by_u = view.su * camera.fx * view.px, by_v = view.sv * camera.fy * view.py;
+                    u[TWIST] = APART ? by_u : u[TWIST] + by_u;
+                    v[TWIST] = APART ? by_v : v[TWIST] + by_v;
                 }
                 if constexpr (ALPHA) {
                     float a, b, e;
                     const float share = view.norm * view.inverse;
                     ray_change<UNIFIED, FOCAL, ALPHA, true>(transform, rays, p, a, b, e);
-                    u[RIGHT - 1] = u0 * a + u1 * b + u2 * e - share * view.su * camera.fx * view.px;
-                    v[RIGHT - 1] = v0 * a + v1 * b + v2 * e - share * view.sv * camera.fy * view.py;
+                    u[RIGHT - 1] = u0 * a + u1 * b + u2 * e;
+                    v[RIGHT - 1] = v0 * a + v1 * b + v2 * e;
+                    const float by_u = -share * view.su * camera.fx * view.px;
+                    const float by_v = -share * view.sv * camera.fy * view.py;
+                    u[TWIST + FOCAL] = APART ? by_u : u[TWIST + FOCAL] + by_u;
+                    v[TWIST + FOCAL] = APART ? by_v : v[TWIST + FOCAL] + by_v;
                 }
                 u[RIGHT] = -view.eu;
                 v[RIGHT] = -view.ev;
@@ -278,15 +292,25 @@ __device__ inline void tile_pass(const Context& c, int first_unit, float* shared
                     for (int r = 0; r < TWIST; ++r)
                         rows[(r * at.slots + m) * at.stride + p] = u[r] * du + v[r] * dv;
 #pragma unroll
-                    for (int k = 0; k <= INTRINSICS; ++k) tail[h][k] += u[TWIST + k] * du + v[TWIST + k] * dv;
+                    for (int k = 0; k <= INTRINSICS; ++k) tail[h][k] += u[SOURCE + k] * du + v[SOURCE + k] * dv;
+                    if constexpr (APART) {
+#pragma unroll
+                        for (int k = 0; k < INTRINSICS; ++k)
+                            of_target[k * TILE + p] += u[TWIST + k] * du + v[TWIST + k] * dv;
+                    }
                     tail[h][INTRINSICS + 1] += du * du + dv * dv;
                 }
             }
             const float whole = exchange_halves<0, 32>(sums, lane);
             edges[(i64)m * STRIDE + lane] += whole;
             if constexpr (STRIDE > 32) {
-                const float rest = exchange_halves<32, STRIDE - 32>(sums, lane);
-                if (lane < STRIDE - 32) edges[(i64)m * STRIDE + 32 + lane] += rest;
+                constexpr int SECOND = STRIDE < 64 ? STRIDE - 32 : 32;
+                const float rest = exchange_halves<32, SECOND>(sums, lane);
+                if (lane < SECOND) edges[(i64)m * STRIDE + 32 + lane] += rest;
+            }
+            if constexpr (STRIDE > 64) {
+                const float rest = exchange_halves<64, STRIDE - 64>(sums, lane);
+                if (lane < STRIDE - 64) edges[(i64)m * STRIDE + 64 + lane] += rest;
             }
         }
         if (!depth_free) continue;
@@ -309,9 +333,21 @@ __device__ inline void tile_pass(const Context& c, int first_unit, float* shared
                 for (int k = 0; k < INTRINSICS + 2; ++k) total[k] += tails[(w * 4 + k) * TILE + thread];
             const float seen = total[INTRINSICS + 1];
             root_q[thread] = seen > TINY ? 1.0f / sqrtf(seen) : 0.0f;
+            if constexpr (APART) {
+                const int at_source = c.frame_camera[frame] * INTRINSICS;
+                const float* sums = edges + (i64)count * STRIDE + thread;
+                for (int k = 0; k < 6 * tail_nodes; ++k) {
+                    float sum = k == unknowns ? total[INTRINSICS] : 0.0f;
+                    for (int w = 0; w < (k < unknowns ? TILE_WARPS : 0); ++w) sum += sums[(w * unknowns + k) * TILE];
 #pragma unroll
-            for (int k = 0; k < 6; ++k)
-                rows[(k * at.slots + count) * at.stride + thread] = k <= INTRINSICS ? total[k] : 0.0f;
+                    for (int i = 0; i < INTRINSICS; ++i) sum += k == at_source + i ? total[i] : 0.0f;
+                    rows[(k % 6 * at.slots + count + k / 6) * at.stride + thread] = sum;
+                }
+            } else {
+#pragma unroll
+                for (int k = 0; k < 6; ++k)
+                    rows[(k * at.slots + count) * at.stride + thread] = k <= INTRINSICS ? total[k] : 0.0f;
+            }
         }
         __syncthreads();
         for (int row = warp; row < 6 * at.slots; row += TILE_WARPS)
@@ -322,7 +358,7 @@ __device__ inline void tile_pass(const Context& c, int first_unit, float* shared
     }
     __syncthreads();
 
-    const i64 size = partial_size(count, depth_free, INTRINSICS);
+    const i64 size = partial_size(count, depth_free, RIGHT - TWIST, tail_nodes);
     float* out = c.partial + c.unit_partial[unit] + slice * size;
     for (int k = thread; k < 36 * at.pairs; k += TILE_THREADS) {
         const int pair = k / 36, value = k % 36;
@@ -338,9 +374,9 @@ __device__ inline void tile_pass(const Context& c, int first_unit, float* shared
     if (lane == 0 && warp < TILE / 32) out[warp] = prior_cost;
 }
 
-#define DEFINE_TILE_KERNEL(NAME, UNIFIED, FOCAL, ALPHA, ROBUST, LARGE, BLOCKS)                              \
+#define DEFINE_TILE_KERNEL(NAME, UNIFIED, FOCAL, ALPHA, APART, ROBUST, LARGE, BLOCKS)                       \
     extern "C" __global__ void __launch_bounds__(TILE_THREADS, BLOCKS)                                      \
         NAME(const Context context, int first_unit) {                                                       \
         DYNAMIC_SHARED(shared);                                                                             \
-        tile_pass<UNIFIED, FOCAL, ALPHA, ROBUST, LARGE>(context, first_unit, shared);                       \
+        tile_pass<UNIFIED, FOCAL, ALPHA, APART, ROBUST, LARGE>(context, first_unit, shared);                \
     }
