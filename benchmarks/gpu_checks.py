@@ -8,6 +8,7 @@
     memcheck, racecheck, initcheck   compute-sanitizer on small solves, where it is installed
     DROID built the extension of DROID's solver is compiled, where its source is given
     network     the DROID network against itself on the CPU; its kernels and graphs against their absence
+    adapters    `python -m benchmarks.networks`, for the public networks whose libraries are installed
     ba          `python -m benchmarks.ba`
     pipeline    `python -m benchmarks.gpu_pipeline`, with short clips
 
@@ -348,6 +349,9 @@ def _sections(vipe: Path | None, droid: Path | None) -> list[list[Section]]:
         Section("graph", [*this, "graph"], 60),
         Section("network", [*tests, "tests/priors/test_droid_gpu.py"], 150),
     ]
+    theirs = ["--vipe", str(vipe)] if vipe else []
+    networks = [sys.executable, "-u", "-m", "benchmarks.networks", "--device", "cuda", *theirs]
+    beside.append(Section("adapters", networks, 150, 3000))
     if droid is not None:
         build = f"import torch, pathlib; Droid.load(pathlib.Path({str(droid)!r}), torch.device('cuda'))"
         command = [sys.executable, "-c", f"from benchmarks.peers.droid_ba import Droid; {build}"]
@@ -356,7 +360,6 @@ def _sections(vipe: Path | None, droid: Path | None) -> list[list[Section]]:
     for tool in ("memcheck", "racecheck", "initcheck") if sanitizer else ():
         watched = [str(sanitizer), "--tool", tool, "--error-exitcode", "9", *this, "small-solves"]
         beside.append(Section(tool, watched, 150))
-    theirs = ["--vipe", str(vipe)] if vipe else []
     peers = [*theirs, *(["--droid", str(droid)] if droid else [])]
     pipeline = [sys.executable, "-u", "-m", "benchmarks.gpu_pipeline", "--frames", "90", *theirs]
     sizes = ["25x120", "25x200", "100x1000", "250x3000", "500x6000"]

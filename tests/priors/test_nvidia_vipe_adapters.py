@@ -35,13 +35,18 @@ def picture(seed: int = 0, height: int = 48, width: int = 64) -> Any:
 
 
 class GeoCalibDouble:
-    def __init__(self, vfov_rad: float) -> None:
+    """Sure of the focal length to a share of it, one for each picture."""
+
+    def __init__(self, vfov_rad: float, doubt: tuple[float, ...] = (0.0,)) -> None:
         self.vfov_rad = vfov_rad
+        self.doubt = torch.tensor(doubt)
         self.asked: list[tuple[tuple[int, ...], dict[str, Any]]] = []
 
     def calibrate(self, img: Tensor, **options: Any) -> dict[str, Any]:
         self.asked.append((tuple(img.shape), options))
-        return {"camera": SimpleNamespace(vfov=torch.tensor([self.vfov_rad]), dist=torch.tensor([[0.4]]))}
+        focal_px = torch.full((len(self.doubt), 2), 24 / math.tan(self.vfov_rad / 2 or 1.0))
+        camera = SimpleNamespace(vfov=torch.tensor([self.vfov_rad]), f=focal_px, dist=torch.tensor([[0.4]]))
+        return {"camera": camera, "focal_uncertainty": self.doubt * focal_px[:, 1]}
 
 
 def test_four_pictures_share_a_focal_length_and_one_tells_a_bent_lens() -> None:
@@ -60,6 +65,18 @@ def test_four_pictures_share_a_focal_length_and_one_tells_a_bent_lens() -> None:
     assert unsure.num_pairs == 0
     assert unsure.log_focal_sigma > found.log_focal_sigma
     assert 40 < unsure.camera.fov_x_deg < 70
+
+
+@pytest.mark.parametrize(
+    ("doubt", "sigma"),
+    [((0.0,), 0.1), ((0.05, 0.1, 0.1, 0.05), math.hypot(0.1, 0.075)), ((2.0,), 0.3), ((math.inf, 0.1), 0.3)],
+)
+def test_the_doubt_of_the_network_widens_the_published_one_up_to_that_of_a_default(
+    doubt: tuple[float, ...], sigma: float
+) -> None:
+    frames = [WorkingFrame(index, picture()[..., 0], picture()) for index in range(4)]
+    found = GeoCalibInit(GeoCalibDouble(math.radians(50), doubt), "pinhole", CPU).estimate(frames, Grid(6, 8))
+    assert found.log_focal_sigma == pytest.approx(sigma)
 
 
 class Metric3dDouble:

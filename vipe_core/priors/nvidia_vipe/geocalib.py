@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from vipe_core.ba.problem import Grid
 from vipe_core.cameras import Camera
@@ -16,7 +17,8 @@ from vipe_core.priors.nvidia_vipe.loading import part, picture, tensors
 from vipe_core.priors.protocols import IntrinsicsEstimate, WorkingFrame
 
 _PICTURES = 4
-# Published errors of the vertical field of view are some 3 to 5 degrees for half of the pictures.
+# Published errors of the vertical field of view are some 3 to 5 degrees for half of the pictures. Pictures in which it
+# sees little to go by are worse; it says how much, by the curvature of what it minimises.
 _LOG_FOCAL_SIGMA = 0.1
 _NARROWEST_RAD, _WIDEST_RAD = math.radians(6), math.radians(170)
 _USUAL_RAD, _UNSURE_SIGMA = math.radians(45), 0.3
@@ -57,9 +59,10 @@ class GeoCalibInit:
         pictures = torch.stack([picture(frames[index].rgb, self._device) for index in chosen]).float() / 255
         height, width = pictures.shape[-2:]
         if self._camera == "pinhole":
-            found = self._model.calibrate(pictures, shared_intrinsics=True)["camera"]
+            answer = self._model.calibrate(pictures, shared_intrinsics=True)
         else:
-            found = self._model.calibrate(pictures, camera_model="simple_mei")["camera"]
+            answer = self._model.calibrate(pictures, camera_model="simple_mei")
+        found = answer["camera"]
         angle = float(found.vfov[0])
         sure = _NARROWEST_RAD < angle < _WIDEST_RAD
         angle = angle if sure else _USUAL_RAD
@@ -69,4 +72,11 @@ class GeoCalibInit:
         camera = Camera(model, (focal_px, focal_px, width / 2, height / 2, *shape), width, height)
         if not sure:
             return IntrinsicsEstimate(camera, _UNSURE_SIGMA, 0)
-        return IntrinsicsEstimate(camera, _LOG_FOCAL_SIGMA, len(chosen))
+        return IntrinsicsEstimate(camera, _sigma(answer["focal_uncertainty"] / found.f[:, 1]), len(chosen))
+
+
+def _sigma(own: Tensor) -> float:
+    """Standard deviation of log f, from that published and those, as shares of the focal length, that the network gives
+    for each picture: the pictures err together, so they count as one of their mean; never worse than a default."""
+    mean = float(own.mean())
+    return min(math.hypot(_LOG_FOCAL_SIGMA, mean), _UNSURE_SIGMA) if math.isfinite(mean) else _UNSURE_SIGMA

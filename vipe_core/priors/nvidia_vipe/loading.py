@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib
+import io
 from pathlib import Path
 from typing import Any
 
@@ -91,7 +93,9 @@ def from_folder(kind: Any, folder: Path, device: torch.device) -> Any:
     if not all((folder / name).is_file() for name in ("config.json", "model.safetensors")):
         raise WeightsMissing(f"{folder} holds no config.json with safetensors; get them with `vipectl models pull`")
     try:
-        network = kind.from_pretrained(str(folder), local_files_only=True, strict=True)
+        # The library prints.
+        with contextlib.redirect_stdout(io.StringIO()):
+            network = kind.from_pretrained(str(folder), local_files_only=True, strict=True)
     except Exception as error:
         first_line = (str(error) or type(error).__name__).splitlines()[0][:200]
         raise WeightsInvalid(f"{folder.name} cannot be read as weights of {kind.__name__}: {first_line}") from error

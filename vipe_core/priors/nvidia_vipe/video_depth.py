@@ -26,10 +26,11 @@ WINDOW_FRAMES, OVERLAP_FRAMES = 32, 10
 _SHORTEST, _PATCH = 518, 14
 # Beyond this aspect its authors take smaller pictures, for memory.
 _WIDEST_ASPECT = 1.777
-_HEADS: dict[VideoDepthSize, dict[str, Any]] = {
+HEADS: dict[VideoDepthSize, dict[str, Any]] = {
     "vits": {"features": 64, "out_channels": [48, 96, 192, 384]},
     "vitl": {"features": 256, "out_channels": [256, 512, 1024, 1024]},
 }
+"""What the head of each size is built with."""
 
 
 class VideoDepthAnything:
@@ -55,7 +56,7 @@ class VideoDepthAnything:
             LibraryMissing, WeightsMissing, WeightsInvalid: See `loading`.
         """
         (build,) = part("depth.videodepthanything.video_depth", "VideoDepthAnything")
-        model = filled(build(encoder=which, **_HEADS[which]), tensors(path), path.name, device)
+        model = filled(build(encoder=which, **HEADS[which]), tensors(path), path.name, device)
         return cls(model, device, half=which == "vitl")
 
     @property
