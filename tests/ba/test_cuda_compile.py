@@ -26,9 +26,8 @@ from vipe_core.ba.cuda.compiler import (
 pytest.importorskip("cuda.core", reason="cuda-core compiles the kernels")
 pytest.importorskip("cuda.bindings.nvrtc", reason="NVRTC compiles the kernels")
 
-# Both cameras, every number of free intrinsics, the most there can be, every architecture.
+# Both cameras, one, two and the most intrinsics that there can be, every architecture.
 _SAMPLE = (
-    ("sm_80", Specialisation(False, False, False, "huber")),
     ("sm_80", Specialisation(True, True, False, "tukey")),
     ("sm_90", Specialisation(False, True, False, "geman_mcclure")),
     ("sm_120", Specialisation(True, True, True, "cauchy", apart=True)),
@@ -69,6 +68,14 @@ def test_compiled_code_is_kept(tmp_path: Path) -> None:
     assert bytes(again.code) == bytes(first.code)
     compile_kernels(source, "sm_80", cache=tmp_path)
     assert kept[0].exists()
+
+
+def test_without_a_place_for_compiled_code_it_is_compiled(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    (tmp_path / "file").touch()
+    with caplog.at_level(logging.WARNING):
+        found = compile_kernels('extern "C" __global__ void nothing() {}', "sm_90", cache=tmp_path / "file" / "kernels")
+    assert len(bytes(found.code)) > 0
+    assert "cannot be kept" in caplog.text
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")

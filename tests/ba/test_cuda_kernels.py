@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from importlib import resources
+from typing import Any
 
 import hypothesis.strategies as st
 import pytest
@@ -46,15 +47,22 @@ pytestmark = pytest.mark.skipif(COMPILER is None, reason="no C++ compiler to run
 
 
 @pytest.fixture(autouse=True)
-def _poisoned_memory() -> Iterator[None]:
+def _poisoned_memory(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """Memory that nobody has written holds NaN and large integers."""
-    before = torch.are_deterministic_algorithms_enabled()
-    torch.use_deterministic_algorithms(True)
+    empty = torch.empty
+
+    def poisoned(*arguments: Any, **options: Any) -> torch.Tensor:
+        tensor = empty(*arguments, **options)
+        if tensor.dtype == torch.bool:
+            return tensor
+        return tensor.fill_(math.nan if tensor.is_floating_point() else torch.iinfo(tensor.dtype).max)
+
+    # Torch's own switch for this imports its compiler.
+    monkeypatch.setattr(torch, "empty", poisoned)
     layout_cache = cuda_solver._layout
     layout_cache.cache_clear()
     yield
     layout_cache.cache_clear()
-    torch.use_deterministic_algorithms(before)
 
 
 def emulated(problem: Problem, state: State, options: Options, order: int = 0) -> Result:
@@ -293,6 +301,62 @@ def test_the_bits_depend_neither_on_the_order_of_threads_nor_of_edges_nor_on_whe
     assert same(emulated(problem, start, options), expected)
 
 
+def _halves(problem: Problem, state: State) -> tuple[Problem, State]:
+    edges = problem.edges
+    twice = (torch.cat((x, x)) for x in (edges.source, edges.target, edges.target_px))
+    return replace(problem, edges=Edges(*twice, torch.cat((edges.weight, edges.weight)) / 2)), state
+
+
+def _elsewhere(problem: Problem, state: State) -> tuple[Problem, State]:
+    return problem, replace(state, cam_from_world=state.cam_from_world @ _MOVED)
+
+
+def _larger(problem: Problem, state: State) -> tuple[Problem, State]:
+    poses = state.cam_from_world.clone()
+    poses[:, :3, 3] *= 4
+    return problem, replace(state, cam_from_world=poses, inverse_depth=state.inverse_depth / 4)
+
+
+_MOVED = se3.exp(torch.tensor([1.0, -2.0, 0.5, 0.3, -0.2, 0.4], dtype=torch.float64))
+
+
+@pytest.mark.parametrize("change", [_halves, _elsewhere, _larger])
+def test_what_must_not_matter(change: Callable[[Problem, State], tuple[Problem, State]]) -> None:
+    """An edge or two of half its weight, where the world's origin is, and the unit of length."""
+    problem, truth = problem_of(FOCAL, num_frames=5, height=6, width=11)
+    problem, start = float32(with_noise(problem, 0.3), disturbed(truth))
+    # The scale is free: damping alone decides along it.
+    problem = replace(problem, free=replace(problem.free, poses=torch.arange(5) > 1))
+    options = Options(max_iterations=4)
+    expected, found = emulated(problem, start, options), emulated(*change(problem, start), options)
+    _, moved = change(problem, expected.state)
+    assert (found.status, found.iterations) == (expected.status, expected.iterations)
+    assert found.cost == pytest.approx(expected.cost, rel=1e-4)
+    assert (found.state.cam_from_world - moved.cam_from_world).abs().max() < 1e-3
+    torch.testing.assert_close(found.state.inverse_depth, moved.inverse_depth, rtol=1e-3, atol=0)
+    torch.testing.assert_close(found.state.intrinsics, moved.intrinsics, rtol=1e-4, atol=1e-5)
+
+
+def test_a_frame_without_edges_changes_nothing() -> None:
+    problem, truth = problem_of(FOCAL, num_frames=4, height=5, width=7)
+    problem, start = float32(with_noise(problem, 0.3), disturbed(truth))
+    # A frame that one edge leaves, and none reaches.
+    edges = problem.edges
+    use = (edges.source != 3) | (edges.target == 2)
+    edges = Edges(*(x[use & (edges.target != 3)] for x in (edges.source, edges.target, edges.target_px, edges.weight)))
+    problem = replace(problem, edges=edges)
+    expected = emulated(problem, start, Options(max_iterations=3))
+    assert_close(expected, solve(problem, start, Options(max_iterations=3)), rtol=1e-3)
+    one_more = State(*(torch.cat((x, x[-1:])) for x in (start.cam_from_world, start.inverse_depth)), start.intrinsics)
+    free = problem.free
+    free = replace(free, poses=torch.cat((free.poses, free.poses[:1] | True)), inverse_depth=torch.ones(5) > 0)
+    found = emulated(replace(problem, free=free), one_more, Options(max_iterations=3))
+    assert torch.equal(found.state.cam_from_world[:4], expected.state.cam_from_world)
+    assert torch.equal(found.state.cam_from_world[4], one_more.cam_from_world[4])
+    assert torch.equal(found.state.inverse_depth[4], one_more.inverse_depth[4])
+    assert found.cost == expected.cost
+
+
 def test_a_frame_with_many_edges() -> None:
     problem, truth = problem_of(FOCAL, num_frames=28, height=4, width=5, reach=27)
     problem, start = float32(with_noise(problem, 0.2), disturbed(truth, log_focal=0.0))
@@ -355,9 +419,10 @@ def test_exact_measurements_end() -> None:
     assert emulated(problem, start, options).status in (Status.CONVERGED, Status.NO_PROGRESS)
 
 
+@pytest.mark.parametrize("kind", [FOCAL, TRUNCATED])
 @pytest.mark.parametrize("where", ["pose", "depth", "intrinsics", "target", "weight", "prior", "prior_weight"])
-def test_input_that_is_not_finite_is_refused(where: str) -> None:
-    problem, truth = problem_of(FOCAL, num_frames=3)
+def test_input_that_is_not_finite_is_refused(where: str, kind: Specialisation) -> None:
+    problem, truth = problem_of(kind, num_frames=3)
     problem, state = float32(with_depth_prior(problem, truth.inverse_depth.float(), 1.0), truth)
     state = State(state.cam_from_world.clone(), state.inverse_depth.clone(), state.intrinsics.clone())
     tensor = {
@@ -372,7 +437,7 @@ def test_input_that_is_not_finite_is_refused(where: str) -> None:
     assert tensor is not None
     for value in (math.nan, math.inf):
         tensor.view(-1)[5 % tensor.numel()] = value
-        result = emulated(problem, state, Options())
+        result = emulated(problem, state, Options(robust=kind.robust))
         assert result.status is Status.NON_FINITE
         assert result.state is state
 
@@ -384,6 +449,10 @@ def test_nothing_to_do() -> None:
     fixed = torch.zeros(3, dtype=torch.bool)
     held = replace(problem, free=Free(fixed, fixed))
     assert emulated(held, start, Options(robust="none")).status is Status.EMPTY
+    edges = problem.edges
+    none = Edges(edges.source[:0], edges.target[:0], edges.target_px[:0], edges.weight[:0])
+    answer = operator._on_gpu(*operator._arguments(replace(problem, edges=none), start, Options()))
+    assert result_of(answer, start).status is Status.EMPTY
 
 
 def test_what_a_gpu_is_checked_with_holds_here(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -396,7 +465,7 @@ def test_what_a_gpu_is_checked_with_holds_here(monkeypatch: pytest.MonkeyPatch) 
     assert all(
         any(cuda_solver.specialisation(*case[:2], Options(robust=case[2])) == kind for case in shapes) for kind in APART
     )
-    small = sorted(shapes, key=lambda case: case[1].inverse_depth.numel())[:2] + shapes[-2:]
+    small = [min(shapes, key=lambda case: case[1].inverse_depth.numel()), shapes[-1]]
     monkeypatch.setattr(gpu_checks, "_shapes", lambda: small)
     monkeypatch.setattr(gpu_checks, "_device", lambda: torch.device("cpu"))
     monkeypatch.setattr(gpu_checks, "_kernels", emulated)

@@ -18,11 +18,14 @@ from pathlib import Path
 
 from vipe_core.ba.cuda.compiler import SYSTEM_KERNELS, TILE_KERNELS, Specialisation, system_source, tile_source
 from vipe_core.ba.cuda.context import Context
+from vipe_core.ba.cuda.launcher import Launch
 
 _DEVICE = Path(__file__).with_name("device.h")
+_SANITIZERS = os.environ.get("VIPE_EMULATOR_SANITIZERS")
+"""Of the compiler, see `benchmarks/ba_sanitize.py`."""
 COMPILER = shutil.which("g++") or shutil.which("clang++")
 ORDERS = 3
-"""In how many orders the threads of a block can take turns."""
+"""In how many orders blocks of threads, and the threads of one, can take turns."""
 
 
 def _wrapper(kernel: str, numbers: int) -> str:
@@ -42,6 +45,8 @@ def _build(source: str) -> ctypes.CDLL:
     assert COMPILER is not None
     command = [COMPILER, "-std=c++17", "-O1", "-fno-strict-aliasing", "-ffp-contract=off", "-U_FORTIFY_SOURCE"]
     command += ["-w", "-shared", "-fPIC", "-x", "c++", "-include", str(_DEVICE)]
+    if _SANITIZERS:
+        command += [f"-fsanitize={_SANITIZERS}", "-fno-sanitize-recover=all", "-g"]
     key = hashlib.sha256("\0".join([source, _DEVICE.read_text(), *command]).encode()).hexdigest()[:24]
     folder = Path(tempfile.gettempdir()) / f"vipe-cuda-emulator-{os.getuid()}"
     folder.mkdir(mode=0o700, exist_ok=True)
@@ -81,10 +86,11 @@ class EmulatedLauncher:
             function.argtypes = [*([ctypes.c_uint] * 3), ctypes.c_int, ctypes.c_void_p]
         self.launched: list[str] = []
 
-    def open(self) -> None:
+    def on_current_stream(self) -> Launch:
         self.launched.clear()
+        return self._launch
 
-    def launch(self, kernel: str, blocks: int, threads: int, shared_bytes: int, parameters: int) -> None:
+    def _launch(self, kernel: str, blocks: int, threads: int, shared_bytes: int, parameters: int) -> None:
         self.launched.append(kernel)
         failure = self._kernels[kernel](blocks, threads, shared_bytes, self._order, parameters)
         if failure is not None:

@@ -2,7 +2,8 @@
 //
 // Threads of a block are fibers on one thread. A fiber runs until a barrier, an exchange within its warp, or its end;
 // which one goes next is a choice (`order`), so code that races gives other results in another order. Blocks of threads
-// run one after the other. Waiting at different places at once is an error, as it is on a GPU.
+// run one after the other, in an order that is a choice as well. Waiting at different places at once is an error, as it
+// is on a GPU.
 #include <setjmp.h>
 #include <ucontext.h>
 
@@ -103,8 +104,15 @@ static bool release(unsigned begin, unsigned end, State state, bool whole) {
     return true;
 }
 
+// Number k of n in one of three orders: forwards, backwards, or in strides of a prime that does not divide n.
+static unsigned in_order(int order, unsigned k, unsigned n) {
+    return order == 0 ? k : order == 1 ? n - 1 - k : (unsigned)((unsigned long long)k * (n % 37 ? 37 : 41) % n);
+}
+
 static const char* run(unsigned blocks, unsigned threads, unsigned shared_bytes, int order, std::function<void()> work) {
     const unsigned guard = 64;
+    // What every GPU since compute capability 8.0 can launch.
+    if (blocks < 1 || threads < 1 || threads > 1024 || shared_bytes > (99 << 10)) return "cannot be launched";
     std::vector<float4> shared(shared_bytes / sizeof(float4) + 1 + guard);
     dynamic_shared = (float*)shared.data();
     body = work;
@@ -112,7 +120,8 @@ static const char* run(unsigned blocks, unsigned threads, unsigned shared_bytes,
     exchanged.resize(threads);
     stacks.resize(threads * STACK_BYTES);
     failure = nullptr;
-    for (block.x = 0; block.x < blocks; ++block.x) {
+    for (unsigned turn = 0; turn < blocks; ++turn) {
+        block.x = in_order(order, turn, blocks);
         std::memset(shared.data(), 0xff, shared.size() * sizeof(float4));  // not a number
         for (unsigned k = 0; k < threads; ++k) {
             Fiber& fiber = fibers[k];
@@ -127,7 +136,7 @@ static const char* run(unsigned blocks, unsigned threads, unsigned shared_bytes,
         }
         for (unsigned ended = 0; ended < threads;) {
             for (unsigned k = 0; k < threads; ++k) {
-                Fiber& fiber = fibers[order == 0 ? k : order == 1 ? threads - 1 - k : k * 37 % threads];
+                Fiber& fiber = fibers[in_order(order, k, threads)];
                 if (fiber.state == READY) resume(fiber);
             }
             ended = 0;

@@ -7,6 +7,7 @@ cuda-core writes it atomically.
 
 from __future__ import annotations
 
+import logging
 import os
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -18,6 +19,8 @@ from vipe_core.ba.cuda.context import CONTEXT_BYTES, CONTROL_BYTES
 from vipe_core.ba.problem import RobustKernel
 from vipe_core.ba.robust import CODE
 from vipe_core.ba.solver import ALPHA_RANGE, MAX_LOG_FOCAL_STEP, MIN_CURVATURE
+
+logger = logging.getLogger(__name__)
 
 _COMMON = ("context.cu", "pixel.cu")
 _SYSTEM = ("largest.cu", "reduce.cu", "factor.cu", "descent.cu")
@@ -106,7 +109,7 @@ def compile_kernels(source: str, architecture: str, *, cache: Path | None, log: 
     """Compile for an architecture like `sm_90`; no GPU is needed.
 
     Args:
-        cache: Folder of compiled code, or None to compile in any case.
+        cache: Folder of compiled code, or None to compile in any case; so does a folder that cannot be written to.
         log: Where the compiler's report on registers and memory goes, if anywhere; anything with `write`.
 
     Returns:
@@ -130,9 +133,12 @@ def compile_kernels(source: str, architecture: str, *, cache: Path | None, log: 
     )
     program = Program(source, "c++", options)
     try:
-        if cache is None:
-            return program.compile("cubin", logs=log)
-        with FileStreamProgramCache(cache) as kept:
-            return program.compile("cubin", logs=log, cache=kept)
+        if cache is not None:
+            try:
+                with FileStreamProgramCache(cache) as kept:
+                    return program.compile("cubin", logs=log, cache=kept)
+            except OSError as error:
+                logger.warning("compiled kernels cannot be kept in %s: %s", cache, error)
+        return program.compile("cubin", logs=log)
     finally:
         program.close()

@@ -21,13 +21,10 @@ from vipe_core.ba.cuda.compiler import (
 logger = logging.getLogger(__name__)
 
 
-class Launcher(Protocol):
-    """Runs kernels one after the other."""
+class Launch(Protocol):
+    """Launches kernels one after the other on one stream."""
 
-    def open(self) -> None:
-        """Take the stream that is current now for the launches that follow."""
-
-    def launch(self, kernel: str, blocks: int, threads: int, shared_bytes: int, parameters: int) -> None:
+    def __call__(self, kernel: str, blocks: int, threads: int, shared_bytes: int, parameters: int) -> None:
         """Launch a kernel.
 
         Args:
@@ -37,6 +34,13 @@ class Launcher(Protocol):
             shared_bytes: Dynamic shared memory.
             parameters: Address of an array of addresses of the parameters; both are read before this returns.
         """
+
+
+class Launcher(Protocol):
+    """Has kernels. Holds nothing of what is launched, so threads may share it."""
+
+    def on_current_stream(self) -> Launch:
+        """Launches on the stream that is current now, whatever is later; its device must be current then, too."""
 
 
 class DeviceLauncher:
@@ -52,7 +56,6 @@ class DeviceLauncher:
 
         self._driver: Any = driver
         self._index = device_index
-        self._stream: Any = None
         with torch.cuda.device(device_index):
             torch.cuda.current_stream().synchronize()  # makes the device's context current in this thread
             self._objects = (_system(device_index), _compiled(device_index, tile_source([kind])))
@@ -71,15 +74,17 @@ class DeviceLauncher:
                 kernel = driver.CUkernel(int(self._kernels[name]))
                 self._check(driver.cuKernelSetAttribute(attribute, most, kernel, device))
 
-    def open(self) -> None:
-        self._stream = self._driver.CUstream(torch.cuda.current_stream(self._index).cuda_stream)
+    def on_current_stream(self) -> Launch:
+        stream = self._driver.CUstream(torch.cuda.current_stream(self._index).cuda_stream)
 
-    def launch(self, kernel: str, blocks: int, threads: int, shared_bytes: int, parameters: int) -> None:
-        self._check(
-            self._driver.cuLaunchKernel(
-                self._kernels[kernel], blocks, 1, 1, threads, 1, 1, shared_bytes, self._stream, parameters, 0
+        def launch(kernel: str, blocks: int, threads: int, shared_bytes: int, parameters: int) -> None:
+            function = self._kernels[kernel]
+            answer = self._driver.cuLaunchKernel(
+                function, blocks, 1, 1, threads, 1, 1, shared_bytes, stream, parameters, 0
             )
-        )
+            self._check(answer)
+
+        return launch
 
     def _check(self, answer: tuple[Any, ...]) -> Any:
         """What a driver function returned beside its error code."""

@@ -19,7 +19,7 @@ from torch import Tensor
 from vipe_core.ba.answer import Answer, num_cameras, report_size
 from vipe_core.ba.cuda.compiler import Specialisation
 from vipe_core.ba.cuda.context import CONTROL_BYTES, Context
-from vipe_core.ba.cuda.launcher import Launcher
+from vipe_core.ba.cuda.launcher import Launch, Launcher
 from vipe_core.ba.cuda.layout import (
     LARGE_SHARED_BYTES,
     SIDE,
@@ -65,6 +65,7 @@ class Adjustment:
 
     def __init__(self, problem: Problem, state: State, options: Options, launcher: Launcher) -> None:
         self._problem, self._state, self._options, self._launcher = problem, state, options, launcher
+        self._on_stream: Launch
         self._device = state.inverse_depth.device
         edges, free, priors = problem.edges, problem.free, problem.priors
         self._kind = kind = specialisation(problem, state, options)
@@ -217,7 +218,7 @@ class Adjustment:
 
     def run(self) -> None:
         """Launch everything, without waiting for any of it. May be captured."""
-        self._launcher.open()
+        self._on_stream = self._launcher.on_current_stream()
         self._reset()
         layout, options = self._layout, self._options
         first = options.initial_scale_px
@@ -245,7 +246,7 @@ class Adjustment:
 
     def assemble(self, times: int) -> None:
         """Launch what a linearisation of the state given takes, so many times: to measure it."""
-        self._launcher.open()
+        self._on_stream = self._launcher.on_current_stream()
         self._reset()
         self._launch("begin", 1, 1)
         for _ in range(times):
@@ -299,7 +300,7 @@ class Adjustment:
         self, kernel: str, blocks: int, threads: int, first: int = 0, shared_bytes: int = 0, *, second: int = 0
     ) -> None:
         address = self._parameters.address(first, second)
-        self._launcher.launch(kernel, blocks, threads, shared_bytes, address)
+        self._on_stream(kernel, blocks, threads, shared_bytes, address)
 
     # -- answer ----------------------------------------------------------------------------------------------------
 

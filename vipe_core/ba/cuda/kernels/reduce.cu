@@ -29,7 +29,7 @@ __device__ inline OwnRows own_rows(const Context& c, int source_camera, int targ
 }
 
 // fold: one block of threads per unit.
-extern "C" __global__ void __launch_bounds__(WIDE_THREADS) fold(const Context c) {
+extern "C" __global__ void __launch_bounds__(WIDE_THREADS, 3) fold(const Context c) {
     const Control& control = *c.control;
     if (control.done || control.mode == IDLE) return;
     const int thread = threadIdx.x, unit = blockIdx.x, own = num_own(c), right = SIX + own, tail = (int)c.num_tail;
