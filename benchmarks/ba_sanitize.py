@@ -30,7 +30,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         "VIPE_EMULATOR_SANITIZERS": "address,undefined",
     }
     arguments = sys.argv[1:] if argv is None else argv
-    command = [sys.executable, "-m", "pytest", "-q", "-p", "no:xdist", _TESTS, *arguments]
+    # Not captured: what is found is said while the process ends.
+    command = [sys.executable, "-m", "pytest", "-q", "-s", "-p", "no:xdist", _TESTS, *arguments]
     return subprocess.run(command, env=os.environ | watched, check=False).returncode
 
 
