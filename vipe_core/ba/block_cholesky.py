@@ -1,9 +1,9 @@
 """Cholesky factorisation of sparse symmetric matrices of 6x6 blocks: order, fill and factor.
 
-One block row per free pose, and a last one for shared intrinsics, which couple with everything. The order is greedy
-minimum degree (Markowitz 1957, Tinney & Walker 1967): a trajectory eliminates to a band, and an edge that closes a loop
-costs the fill of its cycle only. The order is found on sets of neighbours, whose state when a node is eliminated is at
-the same time its column of the factor; so the analysis is exact, and made once per graph.
+One block row per free pose, and last ones for the intrinsics of each camera, which couple with everything. The order
+is greedy minimum degree (Markowitz 1957, Tinney & Walker 1967): a trajectory eliminates to a band, and an edge that
+closes a loop costs the fill of its cycle only. The order is found on sets of neighbours, whose state when a node is
+eliminated is at the same time its column of the factor; so the analysis is exact, and made once per graph.
 """
 
 from __future__ import annotations
@@ -47,13 +47,14 @@ class Structure:
         return len(self.rows)
 
 
-def analyse(num_nodes: int, cliques: Sequence[Sequence[int]], dense_last: bool) -> Structure:
+def analyse(num_nodes: int, cliques: Sequence[Sequence[int]], dense_last: int) -> Structure:
     """Order of elimination and fill.
 
     Args:
         num_nodes: Nodes 0..num_nodes-1.
         cliques: Sets of nodes that are coupled pairwise.
-        dense_last: Add one more node, number `num_nodes`, coupled with all others and eliminated last.
+        dense_last: How many more nodes there are, from number `num_nodes` on, coupled with all others and each other
+            and eliminated last.
     """
     neighbours: list[set[int]] = [set() for _ in range(num_nodes)]
     for clique in cliques:
@@ -62,10 +63,9 @@ def analyse(num_nodes: int, cliques: Sequence[Sequence[int]], dense_last: bool) 
     for node, ring in enumerate(neighbours):
         ring.discard(node)
     order, columns = _eliminate(neighbours)
-    if dense_last:
-        order.append(num_nodes)
-        columns = [[*column, num_nodes] for column in columns]
-        columns.append([])
+    dense = list(range(num_nodes, num_nodes + dense_last))
+    order += dense
+    columns = [[*column, *dense] for column in columns] + [dense[k + 1 :] for k in range(dense_last)]
     place = np.empty(len(order), np.int64)
     place[order] = np.arange(len(order))
     first = np.zeros(len(order) + 1, np.int64)
@@ -76,7 +76,7 @@ def analyse(num_nodes: int, cliques: Sequence[Sequence[int]], dense_last: bool) 
     return Structure(place, first, rows)
 
 
-def pattern(num_nodes: int, cliques: Sequence[Sequence[int]], dense_last: bool) -> Structure:
+def pattern(num_nodes: int, cliques: Sequence[Sequence[int]], dense_last: int) -> Structure:
     """The blocks of a matrix in the order of its nodes, without any fill: to add up, not to be factorised.
 
     Args:
@@ -86,10 +86,8 @@ def pattern(num_nodes: int, cliques: Sequence[Sequence[int]], dense_last: bool) 
     for clique in cliques:
         for node in clique:
             below[node].update(other for other in clique if other > node)
-    rows = [sorted(column) for column in below]
-    if dense_last:
-        rows = [[*column, num_nodes] for column in rows]
-        rows.append([num_nodes])
+    dense = list(range(num_nodes, num_nodes + dense_last))
+    rows = [[*sorted(column), *dense] for column in below] + [dense[k:] for k in range(dense_last)]
     first = np.zeros(len(rows) + 1, np.int64)
     first[1:] = np.cumsum([len(column) for column in rows])
     return Structure(np.arange(len(rows)), first, np.concatenate([np.array(column, np.int64) for column in rows]))

@@ -87,9 +87,6 @@ class HostSolver:
             source_camera=camera_of.numpy(),
             target_camera=camera_of[self._target].numpy(),
         )
-        size = np.where(depth_free, 6 * degree.numpy() + kernels.TAIL, 0)
-        self._offset = np.zeros(num_frames + 1, np.int64)
-        np.cumsum(size * size, out=self._offset[1:])
         self._prior = self._depth_prior(dtype)
 
         self._unknowns = unknowns = unknowns_of(problem)
@@ -101,12 +98,16 @@ class HostSolver:
         self._number_of_view = number[len(unknowns.poses) :]
         self.intrinsics_free = (free.focal, free.distortion and problem.camera_model == "mei")
         self._free = np.array(self.intrinsics_free)
+        # Cameras with unknowns of their own; where nothing is free, one that stands for all.
+        self._num_apart = self._num_cameras if self._free.any() else 1
+        size = np.where(depth_free, 6 * degree.numpy() + kernels.TAIL * self._num_apart, 0)
+        self._offset = np.zeros(num_frames + 1, np.int64)
+        np.cumsum(size * size, out=self._offset[1:])
         self.anything_free = bool(self._num_unknown or self._free.any() or depth_free.any())
         self._structure = self._analyse()
         # Columns of each frame's pose and of each view's extrinsics; -1 where held.
         place = np.append(self._structure.place[: self._num_unknown], -1)
         self._pose_place, self._view_place = place[self._pose_of], place[self._number_of_view]
-        self._shared = self._num_unknown if self._free.any() else -1
         self._per_frame = None if problem.rig is None else self._structure_of_frames()
 
         self._kernel = robust.CODE[options.robust]
@@ -154,7 +155,7 @@ class HostSolver:
         def unknown(frame: int) -> list[int]:
             return [node for node in (pose_of[frame], view_of[frame]) if node >= 0]
 
-        return block_cholesky.analyse(self._num_unknown, self._cliques(unknown), dense_last=bool(self._free.any()))
+        return block_cholesky.analyse(self._num_unknown, self._cliques(unknown), self._num_dense)
 
     def _structure_of_frames(self) -> block_cholesky.Structure:
         """Blocks of the system in the twists of frames, before it is taken to those of a rig: nothing is eliminated."""
@@ -163,7 +164,12 @@ class HostSolver:
         def alone(frame: int) -> list[int]:
             return [frame] if moving[frame] else []
 
-        return block_cholesky.pattern(len(moving), self._cliques(alone), dense_last=bool(self._free.any()))
+        return block_cholesky.pattern(len(moving), self._cliques(alone), self._num_dense)
+
+    @property
+    def _num_dense(self) -> int:
+        """Nodes of intrinsics."""
+        return self._num_apart if self._free.any() else 0
 
     # -- state -----------------------------------------------------------------------------------------------------
 
@@ -227,10 +233,15 @@ class HostSolver:
         measurements, weight, everything, prior = sums.sum(axis=0).tolist()
         priors = self.problem.priors
         if priors.log_focal is not None and self.intrinsics_free[0]:
-            prior += ((np.log(float(state.intrinsics[0])) - priors.log_focal) / priors.log_focal_sigma) ** 2
+            prior += float(np.square(self._log_focal_off(state) / priors.log_focal_sigma).sum())
         if (extrinsic := self._extrinsic_prior(state)) is not None:
             prior += float(extrinsic[0].square().sum())
         return Cost(*torch.tensor([measurements, weight, everything - weight, prior], dtype=torch.float64))
+
+    def _log_focal_off(self, state: State) -> Array:
+        """(C,) prior of log f minus what it is."""
+        now = state.intrinsics.reshape(self._num_cameras, -1)[:, 0].log()
+        return np.asarray((now.new_tensor(self.problem.priors.log_focal) - now).numpy())
 
     def _extrinsic_prior(self, state: State) -> tuple[Tensor, Tensor, Tensor] | None:
         return extrinsic_prior(self.problem.priors, state) if self.problem.free.extrinsics else None
@@ -251,7 +262,8 @@ class HostSolver:
         pose, transform = self._pose(state)
         graph, structure, scale = self._graph, self._structure, self._scale(scale_px)
         sums = np.zeros((len(self._depth_free), 4))
-        per_edge = np.zeros(kernels.ROWS**2 * len(self._source))
+        rows = kernels.ROWS if self._num_apart == 1 else kernels.ROWS_APART
+        per_edge = np.zeros(rows**2 * len(self._source))
         per_frame = np.zeros(self._offset[-1])
         self._over_frames(
             lambda begin, end: kernels.linearise(
@@ -261,6 +273,7 @@ class HostSolver:
                 self._kernel,
                 scale,
                 self._free,
+                self._num_apart,
                 begin,
                 end,
                 sums,
@@ -277,9 +290,12 @@ class HostSolver:
         if self._per_frame is not None:
             place = np.where(self._unknowns.frames.numpy(), np.arange(len(place)), -1)
         source, target = place[self._source.numpy()], place[self._target.numpy()]
-        shared = -1 if self._shared < 0 else assembled.num_nodes - 1
+        dense, source_camera = self._num_dense, graph.source_camera[self._source.numpy()]
+        # Columns of the intrinsics, of all cameras, and of those of an edge.
+        of_cameras = assembled.num_nodes - dense + np.arange(dense) if dense else np.full(1, -1)
+        of_edges = of_cameras[np.stack((source_camera, graph.target_camera), axis=1)] if dense > 1 else of_cameras
 
-        def add(group: Array, offset: Array, matrices: Array) -> tuple[Array, Array]:
+        def add(group: Array, offset: Array, matrices: Array, cameras: Array) -> tuple[Array, Array]:
             blocks, gradient = np.zeros((assembled.num_blocks, 6, 6)), np.zeros((assembled.num_nodes, 6))
             add_twists(
                 assembled.first,
@@ -287,7 +303,7 @@ class HostSolver:
                 group,
                 source,
                 target,
-                shared,
+                np.ascontiguousarray(np.broadcast_to(cameras, (len(group) - 1, cameras.shape[-1]))),
                 adjoint,
                 offset,
                 matrices,
@@ -297,14 +313,14 @@ class HostSolver:
             if turn is None:
                 return blocks, gradient
             into, into_gradient = np.zeros((structure.num_blocks, 6, 6)), np.zeros((structure.num_nodes, 6))
-            last = -1 if shared < 0 else structure.num_nodes - 1
+            last = structure.num_nodes - dense + np.arange(dense)
             add_frames(
                 assembled.first,
                 assembled.rows,
                 blocks,
                 gradient,
                 turn,
-                np.append(self._pose_place, -1),
+                np.append(self._pose_place, np.full(dense, -1)),
                 np.append(self._view_place[self._unknowns.view_of_frame.numpy()], last),
                 structure.first,
                 structure.rows,
@@ -314,8 +330,8 @@ class HostSolver:
             return into, into_gradient
 
         singly = np.arange(len(source) + 1)
-        direct, direct_gradient = add(singly, kernels.ROWS**2 * singly, per_edge)
-        eliminated, eliminated_gradient = add(graph.first, self._offset, per_frame)
+        direct, direct_gradient = add(singly, rows**2 * singly, per_edge, of_edges)
+        eliminated, eliminated_gradient = add(graph.first, self._offset, per_frame, of_cameras)
         if (extrinsic := self._extrinsic_prior(state)) is not None:
             _, hessian, pull = extrinsic
             for view in np.flatnonzero(self._view_place >= 0):
@@ -325,8 +341,8 @@ class HostSolver:
         priors = self.problem.priors
         if priors.log_focal is not None and self.intrinsics_free[0]:
             information = 1 / priors.log_focal_sigma**2
-            direct[-1, 0, 0] += information
-            direct_gradient[-1, 0] += information * (priors.log_focal - np.log(float(state.intrinsics[0])))
+            direct[structure.first[-1 - dense : -1], 0, 0] += information
+            direct_gradient[-dense:, 0] += information * self._log_focal_off(state)
         return HostSystem(
             direct,
             eliminated,
@@ -357,14 +373,13 @@ class HostSolver:
             solution *= scale
         else:
             solution[:] = np.nan
-        log_focal = alpha = 0.0
+        moved, dense = np.zeros((self._num_cameras, 2)), self._num_dense
+        of_cameras = solution[len(solution) - dense :]
         if self.intrinsics_free[0]:
-            log_focal = float(np.clip(solution[-1, 0], -MAX_LOG_FOCAL_STEP, MAX_LOG_FOCAL_STEP))
-            solution[-1, 0] = log_focal
+            moved[:, 0] = of_cameras[:, 0] = np.clip(of_cameras[:, 0], -MAX_LOG_FOCAL_STEP, MAX_LOG_FOCAL_STEP)
         if self._free[1]:
-            current = float(state.intrinsics[4])
-            alpha = float(np.clip(current + solution[-1, 1], *ALPHA_RANGE)) - current
-            solution[-1, 1] = alpha
+            current = state.intrinsics.reshape(self._num_cameras, -1)[:, 4].numpy()
+            moved[:, 1] = of_cameras[:, 1] = np.clip(current + of_cameras[:, 1], *ALPHA_RANGE) - current
         padded = np.concatenate((solution, np.zeros((1, 6))))
         pose = padded[self._pose_place]
         total, extrinsic = pose, None
@@ -378,10 +393,11 @@ class HostSolver:
 
         depth = torch.zeros_like(state.inverse_depth)
         if factorised and self._depth_free.any():
-            twist = np.empty((len(self._source), 8), self._graph.weight.dtype)
-            moved = (system.adjoint @ total[self._source.numpy()][:, :, None])[:, :, 0]
-            twist[:, :6] = total[self._target.numpy()] - moved
-            twist[:, 6], twist[:, 7] = log_focal, alpha
+            twist = np.empty((len(self._source), 10), self._graph.weight.dtype)
+            of_source = (system.adjoint @ total[self._source.numpy()][:, :, None])[:, :, 0]
+            twist[:, :6] = total[self._target.numpy()] - of_source
+            twist[:, 6:8] = moved[self._graph.source_camera[self._source.numpy()]]
+            twist[:, 8:] = moved[self._graph.target_camera]
             gain = np.empty(len(self._depth_free))
             damping_of, out = self._numbers(damping), depth.numpy()
             self._over_frames(
@@ -402,8 +418,8 @@ class HostSolver:
             predicted_drop += float(gain.sum())
         return Step(
             pose=torch.from_numpy(pose),
-            log_focal=torch.full(state.intrinsics.shape[:-1], log_focal, dtype=torch.float64),
-            alpha=torch.full(state.intrinsics.shape[:-1], alpha, dtype=torch.float64),
+            log_focal=torch.from_numpy(moved[:, 0].copy()).reshape(state.intrinsics.shape[:-1]),
+            alpha=torch.from_numpy(moved[:, 1].copy()).reshape(state.intrinsics.shape[:-1]),
             inverse_depth=depth,
             predicted_drop=torch.tensor(predicted_drop, dtype=torch.float64),
             factorised=torch.tensor(factorised),
@@ -426,16 +442,18 @@ class HostSolver:
         """See `Solver.intrinsics_covariance`."""
         scale, factor, factorised = self._factorise(system, damping)
         free = np.flatnonzero(self._free)
-        covariance = np.zeros((2, 2))
-        if not factorised or not (scale[-1, free] > 0).all():
-            covariance[np.ix_(free, free)] = np.nan
-            return torch.from_numpy(covariance)[None]
-        for column in free:
-            unit = np.zeros_like(scale)
-            unit[-1, column] = scale[-1, column]
-            block_cholesky.substitute(self._structure.first, self._structure.rows, factor, unit)
-            covariance[free, column] = (scale[-1] * unit[-1])[free]
-        return torch.from_numpy(covariance)[None]
+        covariances = np.zeros((self._num_apart, 2, 2))
+        for camera in range(self._num_dense):
+            at, covariance = len(scale) - self._num_dense + camera, covariances[camera]
+            if not factorised or not (scale[at, free] > 0).all():
+                covariance[np.ix_(free, free)] = np.nan
+                continue
+            for column in free:
+                unit = np.zeros_like(scale)
+                unit[at, column] = scale[at, column]
+                block_cholesky.substitute(self._structure.first, self._structure.rows, factor, unit)
+                covariance[free, column] = (scale[at] * unit[at])[free]
+        return torch.from_numpy(covariances)
 
     def extrinsic_covariance(self, system: HostSystem, damping: float) -> Tensor:
         """See `Solver.extrinsic_covariance`."""

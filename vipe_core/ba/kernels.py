@@ -24,8 +24,10 @@ from vipe_core.compilation import vectorised
 Array = NDArray[Any]
 
 TILE = 256
-# Rows of an edge: 6 of its twist, log f, alpha, negative residual.
-ROWS = 9
+# Rows of an edge: 6 of its twist, log f, alpha, negative residual; where its two cameras have intrinsics of their own,
+# these are the source's, and log f, alpha of the target's and a row of zeros follow.
+ROWS, ROWS_APART = 9, 12
+# Rows of a frame after those of its edges: log f, alpha and one more of each camera, the first one's is the residual's.
 TAIL = 3
 
 # Rows of the view buffer: homogeneous point, 1 / s, projection before focal length and centre, |X|, weighted residual,
@@ -34,11 +36,12 @@ _X, _Y, _Z, _INV, _PX, _PY, _NORM, _EU, _EV, _SU, _SV, _SQ, _WM = (k * TILE for 
 _VIEW_SIZE = 13 * TILE
 # Least positive number that is not denormal in single precision.
 _TINY = 1.2e-38
-# Rows of the Jacobian buffer: ROWS pairs (u, v), then the derivative by inverse depth, then J_X.
+# Rows of the Jacobian buffer: ROWS_APART pairs (u, v), then the derivative by inverse depth, then J_X.
 _RHS = 16 * TILE
-_BY_DEPTH = 18 * TILE
-_BY_POINT = 20 * TILE
-_JACOBIAN_SIZE = 26 * TILE
+_OF_TARGET = 18 * TILE
+_BY_DEPTH = 24 * TILE
+_BY_POINT = 26 * TILE
+_JACOBIAN_SIZE = 32 * TILE
 
 
 class Graph(NamedTuple):
@@ -204,7 +207,16 @@ def _reweigh(kernel: int, scale: Array, view: Array, n: int) -> None:
 
 @vectorised
 def _differentiate(
-    graph: Graph, pose: Pose, frame: int, order: int, start: int, n: int, free: Array, view: Array, jacobian: Array
+    graph: Graph,
+    pose: Pose,
+    frame: int,
+    order: int,
+    start: int,
+    n: int,
+    free: Array,
+    apart: bool,
+    view: Array,
+    jacobian: Array,
 ) -> None:
     """Scaled rows of a reweighed tile, with zeros after its last cell."""
     row, camera = pose.transform[order], pose.camera[graph.target_camera[order]]
@@ -235,9 +247,12 @@ def _differentiate(
     for k in range(2):
         if free[k]:
             rays = pose.rays_by_intrinsics[graph.source_camera[frame], k]
-            _intrinsic_row(rays, camera, row, k, start, n, view, jacobian)
+            if apart:
+                _apart_rows(rays, camera, row, k, start, n, view, jacobian)
+            else:
+                _intrinsic_row(rays, camera, row, k, start, n, view, jacobian)
     if n < TILE:
-        for r in range(20):
+        for r in range(26):
             for p in range(n, TILE):
                 jacobian[r * TILE + p] = view.dtype.type(0)
 
@@ -262,6 +277,29 @@ def _intrinsic_row(
         v = x * by_point[TILE + p] + y * by_point[3 * TILE + p] + z * by_point[5 * TILE + p]
         out[p] = u + share * (view[_SU + p] * fx * view[_PX + p])
         out[TILE + p] = v + share * (view[_SV + p] * fy * view[_PY + p])
+
+
+@vectorised
+def _apart_rows(
+    rays: Array, camera: Array, row: Array, k: int, start: int, n: int, view: Array, jacobian: Array
+) -> None:
+    """As `_intrinsic_row`, J_X R d ray / dk in the row of the source's camera and d project / dk in the target's."""
+    rx, ry, rz = rays[0][start:], rays[1][start:], rays[2][start:]
+    fx, fy = camera[0], camera[1]
+    r00, r01, r02, r10, r11, r12 = row[0], row[1], row[2], row[4], row[5], row[6]
+    r20, r21, r22 = row[8], row[9], row[10]
+    by_point = jacobian[_BY_POINT : _BY_POINT + 6 * TILE]
+    of_source = jacobian[(12 + 2 * k) * TILE : (14 + 2 * k) * TILE]
+    of_target = jacobian[_OF_TARGET + 2 * k * TILE : _OF_TARGET + (2 * k + 2) * TILE]
+    for p in range(n):
+        a, b, c = rx[p], ry[p], rz[p]
+        x, y, z = r00 * a + r01 * b + r02 * c, r10 * a + r11 * b + r12 * c, r20 * a + r21 * b + r22 * c
+        of_source[p] = x * by_point[p] + y * by_point[2 * TILE + p] + z * by_point[4 * TILE + p]
+        of_source[TILE + p] = x * by_point[TILE + p] + y * by_point[3 * TILE + p] + z * by_point[5 * TILE + p]
+    for p in range(n):
+        share = -view[_NORM + p] * view[_INV + p] if k == 1 else view.dtype.type(1)
+        of_target[p] = share * (view[_SU + p] * fx * view[_PX + p])
+        of_target[TILE + p] = share * (view[_SV + p] * fy * view[_PY + p])
 
 
 @vectorised
@@ -304,7 +342,17 @@ def _gram(rows: Array, triples: int, length: int, total: Array, offset: int) -> 
 
 
 @vectorised
-def _couple(jacobian: Array, free: Array, degree: int, slot: int, coupling: Array, curvature: Array) -> None:
+def _couple(
+    jacobian: Array,
+    free: Array,
+    degree: int,
+    slot: int,
+    source_camera: int,
+    target_camera: int,
+    apart: bool,
+    coupling: Array,
+    curvature: Array,
+) -> None:
     """Rows of the elimination: products of an edge's rows with its derivative by inverse depth."""
     du, dv = jacobian[_BY_DEPTH : _BY_DEPTH + TILE], jacobian[_BY_DEPTH + TILE : _BY_DEPTH + 2 * TILE]
     for r in range(6):
@@ -316,9 +364,19 @@ def _couple(jacobian: Array, free: Array, degree: int, slot: int, coupling: Arra
         if r == 2 or free[r]:
             u = jacobian[(12 + 2 * r) * TILE : (13 + 2 * r) * TILE]
             v = jacobian[(13 + 2 * r) * TILE : (14 + 2 * r) * TILE]
-            out = coupling[(6 * degree + r) * TILE : (6 * degree + r + 1) * TILE]
+            at = 6 * degree + r + (TAIL * source_camera if apart and r < 2 else 0)
+            out = coupling[at * TILE : (at + 1) * TILE]
             for p in range(TILE):
                 out[p] += u[p] * du[p] + v[p] * dv[p]
+    if apart:
+        for r in range(2):
+            if free[r]:
+                u = jacobian[_OF_TARGET + 2 * r * TILE : _OF_TARGET + (2 * r + 1) * TILE]
+                v = jacobian[_OF_TARGET + (2 * r + 1) * TILE : _OF_TARGET + (2 * r + 2) * TILE]
+                at = 6 * degree + TAIL * target_camera + r
+                out = coupling[at * TILE : (at + 1) * TILE]
+                for p in range(TILE):
+                    out[p] += u[p] * du[p] + v[p] * dv[p]
     for p in range(TILE):
         curvature[p] += du[p] * du[p] + dv[p] * dv[p]
 
@@ -379,6 +437,7 @@ def linearise(
     kernel: int,
     scale: Array,
     free: Array,
+    cameras: int,
     begin: int,
     end: int,
     sums: Array,
@@ -390,32 +449,37 @@ def linearise(
 
     Args:
         free: (2,) bool, whether log f and alpha move.
+        cameras: How many have them each for itself.
         sums: As in `evaluate`.
-        direct: (E 81,) float64 zeros, filled with the 9x9 J^T J of every edge in order; only the lower 3x3 blocks.
+        direct: Float64 zeros, filled with the J^T J of every edge in order, 9x9 or of several cameras 12x12; only the
+            lower 3x3 blocks.
         offset: (N + 1,) where the frames begin in `eliminated`.
-        eliminated: Flat float64 zeros: per frame with D edges and free depths, (6 D + 3)^2 numbers that eliminating
-            the undamped depths subtracts; rows are the twists of the edges, log f, alpha, right-hand side.
+        eliminated: Flat float64 zeros: per frame with D edges and free depths, (6 D + 3 cameras)^2 numbers that
+            eliminating the undamped depths subtracts; rows are the twists of the edges, then log f and alpha of every
+            camera and one more, which is the right-hand side of the first camera and zero of others.
     """
     cells, dtype = pose.rays.shape[2], pose.rays.dtype
     most = 0
     for frame in range(begin, end):
         most = max(most, graph.first[frame + 1] - graph.first[frame])
     view, jacobian = np.zeros(_VIEW_SIZE, dtype), np.zeros(_JACOBIAN_SIZE, dtype)
-    coupling = np.zeros((6 * most + TAIL) * TILE, dtype)
+    apart, tail = cameras > 1, TAIL * cameras
+    rows = ROWS_APART if apart else ROWS
+    coupling = np.zeros((6 * most + tail) * TILE, dtype)
     curvature, pull = np.zeros(TILE, dtype), np.zeros(TILE, dtype)
     zero, one, tiny = dtype.type(0), dtype.type(1), dtype.type(_TINY)
     for frame in range(begin, end):
         first, last = graph.first[frame], graph.first[frame + 1]
         degree = last - first
-        size = 6 * degree + TAIL
+        size = 6 * degree + tail
         depth_free = graph.depth_free[frame]
         for start in range(0, cells, TILE):
             n = min(TILE, cells - start)
             if depth_free:
                 sums[frame, 3] += _prior_pull(prior, pose.inverse_depth, frame, start, n, pull, curvature)
+                for p in range(6 * degree * TILE, size * TILE):
+                    coupling[p] = zero
                 for p in range(TILE):
-                    coupling[6 * degree * TILE + p] = zero
-                    coupling[(6 * degree + 1) * TILE + p] = zero
                     coupling[(6 * degree + 2) * TILE + p] = pull[p]
             for order in range(first, last):
                 sums[frame, 2] += _see(graph, pose, frame, order, start, n, view)
@@ -423,10 +487,12 @@ def linearise(
                 sums[frame, 0] += cost
                 sums[frame, 1] += kept
                 _reweigh(kernel, scale, view, n)
-                _differentiate(graph, pose, frame, order, start, n, free, view, jacobian)
-                _gram(jacobian, 3, 2 * TILE, direct, ROWS * ROWS * order)
+                _differentiate(graph, pose, frame, order, start, n, free, apart, view, jacobian)
+                _gram(jacobian, rows // 3, 2 * TILE, direct, rows * rows * order)
                 if depth_free:
-                    _couple(jacobian, free, degree, order - first, coupling, curvature)
+                    from_camera, in_camera = graph.source_camera[frame], graph.target_camera[order]
+                    slot = order - first
+                    _couple(jacobian, free, degree, slot, from_camera, in_camera, apart, coupling, curvature)
             if depth_free and degree:
                 for p in range(TILE):
                     c = curvature[p]
@@ -435,7 +501,7 @@ def linearise(
                     out = coupling[r * TILE : (r + 1) * TILE]
                     for p in range(TILE):
                         out[p] *= curvature[p]
-                _gram(coupling, 2 * degree + 1, TILE, eliminated, offset[frame])
+                _gram(coupling, 2 * degree + cameras, TILE, eliminated, offset[frame])
 
 
 @vectorised
@@ -454,14 +520,14 @@ def _follow(
     """Add an edge's part in the step of the depths: sums rows are curvature, right-hand side, and what is left of it.
 
     Args:
-        twist: (8,) step of the edge's twist, log f and alpha.
+        twist: (10,) step of the edge's twist, and of log f and alpha of its source's and its target's camera.
         change: Scratch for three rows.
     """
     row, camera = pose.transform[order], pose.camera[graph.target_camera[order]]
     depth = pose.inverse_depth[frame][start:]
     fx, fy, alpha = camera[0], camera[1], camera[4]
     t0, t1, t2 = row[3], row[7], row[11]
-    a0, a1, a2, b0, b1, b2, df, da = twist[0], twist[1], twist[2], twist[3], twist[4], twist[5], twist[6], twist[7]
+    a0, a1, a2, b0, b1, b2, df, da = twist[0], twist[1], twist[2], twist[3], twist[4], twist[5], twist[8], twist[9]
     zero, one = view.dtype.type(0), view.dtype.type(1)
     for p in range(3 * TILE):
         change[p] = zero
@@ -514,7 +580,8 @@ def back_substitute(
     """The step of the free inverse depths of the frames begin:end, given that of everything else.
 
     Args:
-        twist: (E, 8) step of the twists of the edges in order, each with the steps of log f and alpha.
+        twist: (E, 10) step of the twists of the edges in order, each with those of log f and alpha of its source's and
+            its target's camera.
         damping: (1,) Levenberg-Marquardt damping.
         step: (N, P) filled where depths are free.
         gain: (N,) float64, filled with gradient times step.

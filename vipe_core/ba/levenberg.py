@@ -238,9 +238,6 @@ def _wider_scales(problem: Problem, state: State, options: Options) -> list[floa
 
 def _solver(problem: Problem, options: Options, state: State) -> Solver[Any]:
     on_host = state.inverse_depth.device.type == "cpu"
-    if state.intrinsics.ndim > 1 and (problem.free.focal or problem.free.distortion):
-        # An edge between two cameras that both move has more unknowns of its own than the compiled loops carry.
-        on_host = False
     return HostSolver(problem, options, state) if on_host else TorchSolver(problem, options, state)
 
 

@@ -5,8 +5,8 @@ operators they would come back to the host, or every caller would carry the stat
 place where a device is chosen (torch's dispatcher), nothing but the answer is read, and what a tracer or a compiler of
 torch sees is one opaque function without side effects.
 
-Where `State.inverse_depth` is on a CPU, the descent of `levenberg.py` runs over compiled loops or torch; on a GPU, the
-CUDA kernels run it, or `levenberg.py` over torch on that GPU: for what `cuda.takes` says they are not for, and where
+Where `State.inverse_depth` is on a CPU, the descent of `levenberg.py` runs over compiled loops; on a GPU, the CUDA
+kernels run it, or `levenberg.py` over torch on that GPU: for what `cuda.takes` says they are not for, and where
 they cannot be had.
 """
 

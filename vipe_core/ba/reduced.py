@@ -56,7 +56,7 @@ def add_twists(
     group: Array,
     source: Array,
     target: Array,
-    shared: int,
+    cameras: Array,
     adjoint: Array,
     offset: Array,
     matrices: Array,
@@ -69,11 +69,11 @@ def add_twists(
         first, rows: The structure.
         group: (G + 1,) where the groups begin among the edges.
         source, target: (E,) columns of the poses.
-        shared: Column of the intrinsics or -1.
+        cameras: (G, T) columns of the intrinsics that the T rows of the tail are of, -1 where held.
         adjoint: (E, 6, 6).
         offset: (G + 1,) where the groups begin in `matrices`.
-        matrices: Flat; per group of D edges nothing, or (6 D + 3)^2 numbers whose lower 3x3 blocks hold the rows of
-            the D twists, log f, alpha, right-hand side.
+        matrices: Flat; per group of D edges nothing, or (6 D + 3 T)^2 numbers whose lower 3x3 blocks hold the rows of
+            the D twists, then log f, alpha and one more T times, the first of which is the right-hand side.
         blocks: (B, 6, 6), added to.
         gradient: (nodes, 6), added to.
     """
@@ -81,12 +81,13 @@ def add_twists(
     for g in range(len(group) - 1):
         most = max(most, group[g + 1] - group[g])
     # Rows of the source, of the twists, of the tail.
-    local = np.empty((6 * most + 9, 6 * most + 9))
+    tail = cameras.shape[1]
+    local = np.empty((6 * most + 6 + 3 * tail, 6 * most + 6 + 3 * tail))
     for g in range(len(group) - 1):
         begin, degree, base = group[g], group[g + 1] - group[g], offset[g]
         if base == offset[g + 1] or degree == 0:
             continue
-        size = 6 * degree + 3
+        size = 6 * degree + 3 * tail
         for a in range(size):
             for b in range(a + 1):
                 local[6 + a, 6 + b] = matrices[base + a * size + b]
@@ -110,7 +111,8 @@ def add_twists(
             for b in range(6, size + 6):
                 local[b, a] = local[a, b]
 
-        i, right = source[begin], size + 5
+        i, end = source[begin], 6 + 6 * degree
+        right = end + 2
         _add(first, rows, i, i, local, 0, 0, 6, blocks)
         for m in range(degree):
             j, at = target[begin + m], 6 + 6 * m
@@ -120,21 +122,29 @@ def add_twists(
                 _add(first, rows, j, k, local, at, 6 + 6 * other, 6, blocks)
                 if j == k and m != other:
                     _add(first, rows, j, k, local, 6 + 6 * other, at, 6, blocks)
-            if shared >= 0:
-                _add(first, rows, shared, j, local, right - 2, at, 2, blocks)
+            for t in range(tail):
+                _add(first, rows, cameras[g, t], j, local, end + 3 * t, at, 2, blocks)
             if j >= 0:
                 for a in range(6):
                     gradient[j, a] += local[right, at + a]
         if i >= 0:
             for a in range(6):
                 gradient[i, a] += local[right, a]
-        if shared >= 0:
-            _add(first, rows, shared, i, local, right - 2, 0, 2, blocks)
-            corner = blocks[first[shared]]
+        for t in range(tail):
+            camera, at = cameras[g, t], end + 3 * t
+            if camera < 0:
+                continue
+            _add(first, rows, camera, i, local, at, 0, 2, blocks)
             for a in range(2):
-                gradient[shared, a] += local[right, right - 2 + a]
-                for b in range(2):
-                    corner[a, b] += local[right - 2 + a, right - 2 + b]
+                gradient[camera, a] += local[right, at + a]
+            for other in range(tail):
+                # Every pair is met twice: of one camera both count, of two the one below the diagonal.
+                k, beside = cameras[g, other], end + 3 * other
+                if 0 <= k <= camera:
+                    block = blocks[_slot(first, rows, camera, k)]
+                    for a in range(2):
+                        for b in range(2):
+                            block[a, b] += local[at + a, beside + b]
 
 
 @vectorised
@@ -167,10 +177,10 @@ def add_frames(
     """Take a system in the twists of frames to one in the poses and extrinsics of a rig, see `rigs.py`.
 
     Args:
-        first, rows, blocks, gradient: The system of F frames, and one node more where intrinsics are free.
+        first, rows, blocks, gradient: The system of F frames, and one node more for each camera with free intrinsics.
         turn: (N, 6, 6) maps from twists of poses to those of frames.
-        pose: (N + 1,) columns of the poses in the other structure; -1 where held, and for the intrinsics.
-        view: (N + 1,) those of the extrinsics, and of the intrinsics.
+        pose: (nodes,) columns of the poses in the other structure; -1 where held, and for the intrinsics.
+        view: (nodes,) those of the extrinsics, and of the intrinsics.
         into_first, into_rows, into, into_gradient: That structure, added to.
     """
     left, right, both = np.empty((6, 6)), np.empty((6, 6)), np.empty((6, 6))

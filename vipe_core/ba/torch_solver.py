@@ -1,7 +1,7 @@
 """The normal equations of dense bundle adjustment, reduced to poses and intrinsics, in torch, on any device.
 
-It solves what neither the compiled loops of a CPU (`host_solver.py`) nor the kernels of a GPU (`cuda/`) are for, and is
-what both are held to.
+It solves on a GPU what the kernels there (`cuda/`) are not for, and where they cannot be had; and it is what these and
+the compiled loops of a CPU (`host_solver.py`) are held to.
 
 Problem. Minimise over poses G_i = cam_from_world, intrinsics k = (log f, alpha) and one inverse depth d per cell
 

@@ -281,7 +281,7 @@ def _nodes(unknowns: Unknowns, target: Ints, units: Ints) -> tuple[Ints, Ints, i
         else:
             cliques += [behind[frame] + behind[other] for other in others]
     num_nodes = int(free.sum())
-    place = np.append(block_cholesky.analyse(num_nodes, cliques, dense_last=False).place, -1)[number]
+    place = np.append(block_cholesky.analyse(num_nodes, cliques, dense_last=0).place, -1)[number]
     return place[: len(unknowns.poses)], place[len(unknowns.poses) :], num_nodes
 
 
