@@ -272,7 +272,7 @@ class HostSolver:
                 self._prior,
                 self._kernel,
                 scale,
-                self._free,
+                np.append(self._free, self._num_apart > 1),
                 self._num_apart,
                 begin,
                 end,

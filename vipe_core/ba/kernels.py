@@ -207,16 +207,7 @@ def _reweigh(kernel: int, scale: Array, view: Array, n: int) -> None:
 
 @vectorised
 def _differentiate(
-    graph: Graph,
-    pose: Pose,
-    frame: int,
-    order: int,
-    start: int,
-    n: int,
-    free: Array,
-    apart: bool,
-    view: Array,
-    jacobian: Array,
+    graph: Graph, pose: Pose, frame: int, order: int, start: int, n: int, free: Array, view: Array, jacobian: Array
 ) -> None:
     """Scaled rows of a reweighed tile, with zeros after its last cell."""
     row, camera = pose.transform[order], pose.camera[graph.target_camera[order]]
@@ -247,7 +238,7 @@ def _differentiate(
     for k in range(2):
         if free[k]:
             rays = pose.rays_by_intrinsics[graph.source_camera[frame], k]
-            if apart:
+            if free[2]:
                 _apart_rows(rays, camera, row, k, start, n, view, jacobian)
             else:
                 _intrinsic_row(rays, camera, row, k, start, n, view, jacobian)
@@ -343,17 +334,13 @@ def _gram(rows: Array, triples: int, length: int, total: Array, offset: int) -> 
 
 @vectorised
 def _couple(
-    jacobian: Array,
-    free: Array,
-    degree: int,
-    slot: int,
-    source_camera: int,
-    target_camera: int,
-    apart: bool,
-    coupling: Array,
-    curvature: Array,
+    jacobian: Array, free: Array, degree: int, slot: int, cameras: tuple[int, int], coupling: Array, curvature: Array
 ) -> None:
-    """Rows of the elimination: products of an edge's rows with its derivative by inverse depth."""
+    """Rows of the elimination: products of an edge's rows with its derivative by inverse depth.
+
+    Args:
+        cameras: Of its source and its target.
+    """
     du, dv = jacobian[_BY_DEPTH : _BY_DEPTH + TILE], jacobian[_BY_DEPTH + TILE : _BY_DEPTH + 2 * TILE]
     for r in range(6):
         u, v = jacobian[2 * r * TILE : (2 * r + 1) * TILE], jacobian[(2 * r + 1) * TILE : (2 * r + 2) * TILE]
@@ -364,16 +351,16 @@ def _couple(
         if r == 2 or free[r]:
             u = jacobian[(12 + 2 * r) * TILE : (13 + 2 * r) * TILE]
             v = jacobian[(13 + 2 * r) * TILE : (14 + 2 * r) * TILE]
-            at = 6 * degree + r + (TAIL * source_camera if apart and r < 2 else 0)
+            at = 6 * degree + r + (TAIL * cameras[0] if free[2] and r < 2 else 0)
             out = coupling[at * TILE : (at + 1) * TILE]
             for p in range(TILE):
                 out[p] += u[p] * du[p] + v[p] * dv[p]
-    if apart:
+    if free[2]:
         for r in range(2):
             if free[r]:
                 u = jacobian[_OF_TARGET + 2 * r * TILE : _OF_TARGET + (2 * r + 1) * TILE]
                 v = jacobian[_OF_TARGET + (2 * r + 1) * TILE : _OF_TARGET + (2 * r + 2) * TILE]
-                at = 6 * degree + TAIL * target_camera + r
+                at = 6 * degree + TAIL * cameras[1] + r
                 out = coupling[at * TILE : (at + 1) * TILE]
                 for p in range(TILE):
                     out[p] += u[p] * du[p] + v[p] * dv[p]
@@ -448,8 +435,8 @@ def linearise(
     """Cost and normal equations, in the twists of the edges, of the frames begin:end.
 
     Args:
-        free: (2,) bool, whether log f and alpha move.
-        cameras: How many have them each for itself.
+        free: (3,) bool, whether log f and alpha move, and whether several cameras have them each for itself.
+        cameras: How many do.
         sums: As in `evaluate`.
         direct: Float64 zeros, filled with the J^T J of every edge in order, 9x9 or of several cameras 12x12; only the
             lower 3x3 blocks.
@@ -463,8 +450,7 @@ def linearise(
     for frame in range(begin, end):
         most = max(most, graph.first[frame + 1] - graph.first[frame])
     view, jacobian = np.zeros(_VIEW_SIZE, dtype), np.zeros(_JACOBIAN_SIZE, dtype)
-    apart, tail = cameras > 1, TAIL * cameras
-    rows = ROWS_APART if apart else ROWS
+    tail, rows = TAIL * cameras, ROWS_APART if free[2] else ROWS
     coupling = np.zeros((6 * most + tail) * TILE, dtype)
     curvature, pull = np.zeros(TILE, dtype), np.zeros(TILE, dtype)
     zero, one, tiny = dtype.type(0), dtype.type(1), dtype.type(_TINY)
@@ -487,12 +473,11 @@ def linearise(
                 sums[frame, 0] += cost
                 sums[frame, 1] += kept
                 _reweigh(kernel, scale, view, n)
-                _differentiate(graph, pose, frame, order, start, n, free, apart, view, jacobian)
+                _differentiate(graph, pose, frame, order, start, n, free, view, jacobian)
                 _gram(jacobian, rows // 3, 2 * TILE, direct, rows * rows * order)
                 if depth_free:
-                    from_camera, in_camera = graph.source_camera[frame], graph.target_camera[order]
-                    slot = order - first
-                    _couple(jacobian, free, degree, slot, from_camera, in_camera, apart, coupling, curvature)
+                    ends = graph.source_camera[frame], graph.target_camera[order]
+                    _couple(jacobian, free, degree, order - first, ends, coupling, curvature)
             if depth_free and degree:
                 for p in range(TILE):
                     c = curvature[p]
