@@ -283,11 +283,18 @@ def test_any_graph(graph: tuple[Problem, State]) -> None:
     assert torch.equal(found.state.inverse_depth[held], start.inverse_depth[held])
 
 
+@pytest.mark.parametrize("rig", [False, True])
 def test_the_bits_depend_neither_on_the_order_of_threads_nor_of_edges_nor_on_where_rows_are_kept(
-    monkeypatch: pytest.MonkeyPatch,
+    rig: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    problem, truth = problem_of(KINDS[5], num_frames=5, height=11, width=27, reach=2)
-    problem, start = float32(with_noise(problem, 0.3), disturbed(truth))
+    if rig:
+        problem, truth = rig_scene("mei", num_views=3, own_intrinsics=True)
+        free = replace(problem.free, focal=True, distortion=True, extrinsics=True)
+        problem, start = replace(problem, free=free), disturbed_rig(problem, truth, twist=0.005, turn=0.005)
+    else:
+        problem, truth = problem_of(KINDS[5], num_frames=5, height=11, width=27, reach=2)
+        start = disturbed(truth)
+    problem, start = float32(with_noise(problem, 0.3), start)
     options = Options(max_iterations=3)
     expected = emulated(problem, start, options)
     assert all(same(emulated(problem, start, options, order), expected) for order in range(1, ORDERS))

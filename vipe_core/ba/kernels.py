@@ -157,13 +157,13 @@ def _rho_sum(kernel: int, scale: Array, view: Array, n: int) -> tuple[float, flo
             total += weight[p] * third * (one - inside * inside * inside)
     else:
         c, final2 = math.sqrt(c2), scale[1]
-        wide = max(c2 - final2, view.dtype.type(_TINY))
-        most = wide / c
+        wide, least = max(c2 - final2, view.dtype.type(_TINY)), final2 / c2
         for p in range(n):
             s = squared[p]
             root = math.sqrt(s)
-            gap = min(c - root, most) if root < c else root - root
-            total += weight[p] * (s if s * c2 <= final2 * final2 else final2 * (one - gap * (gap / wide)))
+            share = (root * (two * c - root) - final2) / wide
+            share = min(max(share, least), one) if root < c else one + (root - root)
+            total += weight[p] * (s if s * c2 <= final2 * final2 else final2 * share)
     return total, kept
 
 

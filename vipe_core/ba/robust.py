@@ -4,7 +4,7 @@ Graduated non-convexity starts from a wider scale than the one it ends at. Most 
 least squares, rho(s) = min(s, c^2), has a surrogate of its own (Yang et al. 2020, equation 13): with a scale u > c,
 mu = c^2 / (u^2 - c^2), it is s up to c^4 / u^2, constant from u^2 on, and between them, concave and smooth,
 
-    rho(s) = c^2 (1 - (u - sqrt(s))^2 / (u^2 - c^2))
+    rho(s) = c^2 (r (2 u - r) - c^2) / (u^2 - c^2),    rho'(s) = c^2 (u - r) / (r (u^2 - c^2)),    r = sqrt(s)
 
 At u^2 = 2 max s, where it is convex over all residuals, that is their first mu; dividing u^2 multiplies mu.
 """
@@ -45,8 +45,10 @@ def cost(kernel: RobustKernel, scale_px: float, squared: Tensor, final_px: float
     if kernel == "tukey":
         return c2 / 3 * (1 - _inside(c2, squared) ** 3)
     if kernel == "truncated":
-        inlier, gap, wide = _truncation(scale_px, final_px, squared)
-        return torch.where(inlier, squared, (c2 - wide) * (1 - gap * (gap / wide)))
+        inlier, final2, wide = _truncation(scale_px, final_px, squared)
+        root = squared.sqrt()
+        share = torch.where(root < scale_px, (root * (2 * scale_px - root) - final2) / wide, 1 + (root - root))
+        return torch.where(inlier, squared, final2 * share.clamp(final2 / c2, 1))
     return squared * (c2 / (c2 + squared))
 
 
@@ -65,8 +67,11 @@ def root_slope(kernel: RobustKernel, scale_px: float, squared: Tensor, final_px:
     if kernel == "tukey":
         return _inside(c2, squared)
     if kernel == "truncated":
-        inlier, gap, wide = _truncation(scale_px, final_px, squared)
-        return torch.where(inlier, 1, ((c2 - wide) * (gap / wide) / squared.sqrt()).sqrt())
+        inlier, final2, wide = _truncation(scale_px, final_px, squared)
+        root = squared.sqrt()
+        # Up to here it is less than where truncation begins.
+        gap = (scale_px - root).clamp(0, wide / scale_px)
+        return torch.where(inlier, 1, (final2 * (gap / wide) / root).sqrt())
     return (squared / c2 + 1).reciprocal()
 
 
@@ -75,10 +80,7 @@ def _inside(c2: float, squared: Tensor) -> Tensor:
     return torch.where(squared < c2, 1 - squared / c2, squared - squared)
 
 
-def _truncation(scale_px: float, final_px: float | None, squared: Tensor) -> tuple[Tensor, Tensor, float]:
-    """Whether s is below all truncation, by how much its root is below its end, and u^2 - c^2."""
+def _truncation(scale_px: float, final_px: float | None, squared: Tensor) -> tuple[Tensor, float, float]:
+    """Whether s is below all truncation, c^2, and u^2 - c^2."""
     c2, final2 = scale_px * scale_px, (final_px or scale_px) ** 2
-    wide, root = max(c2 - final2, torch.finfo(torch.float32).tiny), squared.sqrt()
-    # Up to here it is less than where truncation begins.
-    gap = torch.where(root < scale_px, (scale_px - root).clamp_max(wide / scale_px), root - root)
-    return squared * c2 <= final2 * final2, gap, wide
+    return squared * c2 <= final2 * final2, final2, max(c2 - final2, torch.finfo(torch.float32).tiny)

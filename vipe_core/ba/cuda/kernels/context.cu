@@ -187,11 +187,9 @@ __device__ inline double robust_cost(int kernel, double scale, double final, dou
     double c2 = scale * scale;
     switch (kernel) {
         case TRUNCATED: {
-            const double f2 = final * final, wide = c2 - f2 > 1e-300 ? c2 - f2 : 1e-300;
-            if (squared * c2 <= f2 * f2) return squared;
-            double gap = scale - sqrt(squared);
-            gap = gap < 0 ? 0 : gap > wide / scale ? wide / scale : gap;
-            return f2 * (1 - gap * (gap / wide));
+            const double f2 = final * final, root = sqrt(squared);
+            if (root >= scale || squared * c2 <= f2 * f2) return root >= scale ? f2 : squared;
+            return f2 * (root * (2 * scale - root) - f2) / (c2 - f2);
         }
         case HUBER: return squared <= c2 ? squared : 2 * scale * sqrt(squared) - c2;
         case CAUCHY: return c2 * log1p(squared / c2);

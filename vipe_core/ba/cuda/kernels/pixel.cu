@@ -119,18 +119,14 @@ __device__ inline Scale scale_from(double c, double final) {
     return Scale{(float)c, (float)c * (float)c, (float)final * (float)final};
 }
 
-// Of the truncated kernel: where its slope falls from one to zero, how far below its end s is, over how much.
-struct Truncation {
-    bool inlier;
-    float root, gap, wide;
-};
+// Of the truncated kernel, see `vipe_core/ba/robust.py`: whether s is below all truncation, and over how much it sets in.
+__device__ inline bool is_inlier(const Scale& scale, float s) {
+    return s * scale.c2 <= scale.final2 * scale.final2;
+}
 
-__device__ inline Truncation truncation(const Scale& scale, float s) {
-    Truncation at{s * scale.c2 <= scale.final2 * scale.final2, sqrtf(s), 0.0f, scale.c2 - scale.final2};
-    at.wide = at.wide > TINY ? at.wide : TINY;
-    const float most = at.wide / scale.c, gap = scale.c - at.root;
-    at.gap = gap > 0.0f ? (gap > most ? most : gap) : at.root - at.root;  // not a number where s is not finite
-    return at;
+__device__ inline float width(const Scale& scale) {
+    const float wide = scale.c2 - scale.final2;
+    return wide > TINY ? wide : TINY;
 }
 
 template <int ROBUST>
@@ -144,8 +140,11 @@ __device__ inline float rho(const Scale& scale, float s) {
         return c2 / 3.0f * (1.0f - inside * inside * inside);
     }
     if constexpr (ROBUST == TRUNCATED) {
-        const Truncation at = truncation(scale, s);
-        return at.inlier ? s : scale.final2 * (1.0f - at.gap * (at.gap / at.wide));
+        const float root = sqrtf(s), least = scale.final2 / c2;
+        float share = (root * (2.0f * scale.c - root) - scale.final2) / width(scale);
+        share = share < least ? least : share > 1.0f ? 1.0f : share;
+        share = root < scale.c ? share : 1.0f + (root - root);  // not a number where s is not finite
+        return is_inlier(scale, s) ? s : scale.final2 * share;
     }
     return s;
 }
@@ -164,8 +163,10 @@ __device__ inline void reweigh(const Scale& scale, View& view) {
         root = root < 0.0f ? 0.0f : root;
     }
     if constexpr (ROBUST == TRUNCATED) {
-        const Truncation at = truncation(scale, view.squared);
-        root = at.inlier ? 1.0f : sqrtf(scale.final2 * (at.gap / at.wide) / at.root);
+        const float r = sqrtf(view.squared), wide = width(scale), most = wide / scale.c;
+        float gap = scale.c - r;
+        gap = gap < 0.0f ? 0.0f : gap > most ? most : gap;
+        root = is_inlier(scale, view.squared) ? 1.0f : sqrtf(scale.final2 * (gap / wide) / r);
     }
     view.eu *= root;
     view.ev *= root;
