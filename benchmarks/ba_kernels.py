@@ -19,7 +19,7 @@ from rich.console import Console
 from rich.table import Table
 
 from vipe_core.ba.cuda.compiler import Specialisation, compile_kernels, specialisations, system_source, tile_source
-from vipe_core.ba.cuda.layout import TILE_THREADS
+from vipe_core.ba.cuda.context import TILE_THREADS
 
 ARCHITECTURES = ("sm_80", "sm_90", "sm_120")
 _REGISTERS = 65536

@@ -364,6 +364,18 @@ def test_a_frame_without_edges_changes_nothing() -> None:
     assert found.cost == expected.cost
 
 
+def test_a_lens_that_bends_much() -> None:
+    """More than a parabolic mirror does, as fisheye lenses do."""
+    problem, truth = scene("mei", num_frames=5, height=7, width=9, alpha=2.5, distortion_free=True)
+    start = disturbed(truth, twist=0.01, depth=0.05, log_focal=0.02)
+    start.intrinsics[4] += 0.05
+    problem, start = float32(with_noise(problem, 0.1), start)
+    options = Options(max_iterations=6)
+    found = emulated(problem, start, options)
+    assert_close(found, solve(problem, start, options), rtol=1e-3)
+    assert float(found.state.intrinsics[4]) == pytest.approx(2.5, abs=0.02)
+
+
 def test_a_frame_with_many_edges() -> None:
     problem, truth = problem_of(FOCAL, num_frames=28, height=4, width=5, reach=27)
     problem, start = float32(with_noise(problem, 0.2), disturbed(truth, log_focal=0.0))

@@ -20,23 +20,20 @@ from vipe_core.ba import robust
 from vipe_core.ba.host_solver import HostSolver
 from vipe_core.ba.problem import NO_COVARIANCE, Covariance, Edges, Options, Problem, Result, Rig, State, Status
 from vipe_core.ba.reprojection import require_supported
+from vipe_core.ba.rules import (
+    ACCEPTED_FACTOR,
+    MAX_DAMPING,
+    MIN_DAMPING,
+    NARROWING,
+    NEGLIGIBLE_COST,
+    REJECTED_FACTOR,
+    SIGMA_DAMPINGS,
+    TRUSTED_DAMPING,
+    UNTRIED_SHARE,
+)
 from vipe_core.ba.scale import largest_residual_px
-from vipe_core.ba.solver import MIN_DAMPING, Cost, Solver, Step
+from vipe_core.ba.solver import Cost, Solver, Step
 from vipe_core.ba.torch_solver import TorchSolver
-
-_MAX_DAMPING = 1e8
-# A free gauge does not couple with the focal length, so the least damping that makes the system invertible will do.
-_SIGMA_DAMPINGS = (1e-9, 1e-7, 1e-5)
-_ACCEPTED_FACTOR = 0.2
-_REJECTED_FACTOR = 10.0
-# Mean squared residual, px^2, at which exact data is solved and only rounding is left.
-_NEGLIGIBLE_COST = 1e-14
-# A step that is not even tried must be expected to gain less than this share of what ends the solve after it was.
-_UNTRIED_SHARE = 0.1
-# ... and by a model that damping has not shortened much.
-_TRUSTED_DAMPING = 1e-2
-# Graduated non-convexity divides the squared scale by this at every step.
-_NARROWING = 1.4
 
 
 def require_solvable(problem: Problem, state: State) -> None:
@@ -76,8 +73,8 @@ def descend(problem: Problem, state: State, options: Options) -> Result:
 
 def _intrinsics_covariances(solver: Solver[Any], descent: _Descent) -> tuple[Covariance, ...]:
     """Of each camera, by the least damping at which the system can be solved."""
-    found = torch.stack([solver.intrinsics_covariance(descent.system(), damping) for damping in _SIGMA_DAMPINGS])
-    values = np.array(_read(*found.flatten())).reshape(len(_SIGMA_DAMPINGS), -1, 4)
+    found = torch.stack([solver.intrinsics_covariance(descent.system(), damping) for damping in SIGMA_DAMPINGS])
+    values = np.array(_read(*found.flatten())).reshape(len(SIGMA_DAMPINGS), -1, 4)
     chosen: list[Covariance] = []
     for camera in range(values.shape[1]):
         nan = math.nan
@@ -92,7 +89,7 @@ def _intrinsics_covariances(solver: Solver[Any], descent: _Descent) -> tuple[Cov
 
 def _extrinsic_covariances(solver: Solver[Any], system: Any) -> Tensor:
     """(V, 6, 6) of each camera of a rig, likewise."""
-    return _sound([solver.extrinsic_covariance(system, damping) for damping in _SIGMA_DAMPINGS])
+    return _sound([solver.extrinsic_covariance(system, damping) for damping in SIGMA_DAMPINGS])
 
 
 def extrinsic_covariances(problem: Problem, state: State, options: Options) -> Tensor:
@@ -120,7 +117,7 @@ def pose_covariance(problem: Problem, state: State, frame: int, options: Options
     problem, state = _on_device(problem, state)
     solver = _solver(problem, options, state)
     system = solver.linearise(state, options.robust_scale_px)
-    return _sound([solver.pose_covariance(system, damping, frame)[None] for damping in _SIGMA_DAMPINGS])[0].cpu()
+    return _sound([solver.pose_covariance(system, damping, frame)[None] for damping in SIGMA_DAMPINGS])[0].cpu()
 
 
 def _sound(by_damping: Sequence[Tensor]) -> Tensor:
@@ -179,7 +176,7 @@ class _Descent:
         step = solver.step(self.system(), damping)
         total = self.cost.total(self._lost_rho)
         enough = options.relative_tolerance * total
-        minimum = step.factorised & (step.predicted_drop < _UNTRIED_SHARE * enough) & (damping <= _TRUSTED_DAMPING)
+        minimum = step.factorised & (step.predicted_drop < UNTRIED_SHARE * enough) & (damping <= TRUSTED_DAMPING)
         if self._on_host and bool(minimum):
             return Status.CONVERGED
         self.iterations += 1
@@ -188,18 +185,18 @@ class _Descent:
         new_total = cost.total(self._lost_rho)
         better = step.factorised & (new_total < total)
         gain = torch.where(better, total - new_total, step.predicted_drop)
-        solved = step.factorised & (gain < enough) | better & (new_total < _NEGLIGIBLE_COST * cost.weight)
+        solved = step.factorised & (gain < enough) | better & (new_total < NEGLIGIBLE_COST * cost.weight)
         at_minimum, factorised, accepted, converged = _read(minimum, step.factorised, better, solved)
         if at_minimum:
             return Status.CONVERGED
         if accepted:
             self.state, self.cost = state, cost
-            self._damping = max(damping * _ACCEPTED_FACTOR, self._min_damping)
+            self._damping = max(damping * ACCEPTED_FACTOR, self._min_damping)
         else:
-            self._damping = max(damping * _REJECTED_FACTOR, self._min_damping)
+            self._damping = max(damping * REJECTED_FACTOR, self._min_damping)
         if converged:
             return Status.CONVERGED
-        if self._damping > _MAX_DAMPING:
+        if self._damping > MAX_DAMPING:
             return Status.NO_PROGRESS if factorised else Status.SINGULAR
         return None
 
@@ -232,7 +229,7 @@ def _wider_scales(problem: Problem, state: State, options: Options) -> list[floa
     if first <= final:
         return []
     span = 2 * math.log(first / final)
-    levels = min(math.ceil(span / math.log(_NARROWING)), max(options.max_iterations // 2, 1))
+    levels = min(math.ceil(span / math.log(NARROWING)), max(options.max_iterations // 2, 1))
     return [final * math.exp(span / 2 * (levels - k) / levels) for k in range(levels)]
 
 

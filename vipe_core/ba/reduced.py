@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vipe_core.ba.solver import MIN_CURVATURE
+from vipe_core.ba.rules import MIN_CURVATURE
 from vipe_core.compilation import vectorised
 
 Array = NDArray[Any]

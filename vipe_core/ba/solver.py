@@ -5,19 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Protocol, TypeVar
 
-import torch
 from torch import Tensor
 
 from vipe_core.ba.problem import State
-
-# Largest change of log f in one step: beyond, the linearisation says nothing.
-MAX_LOG_FOCAL_STEP = 0.3
-# An orthographic fisheye, the most bent of all, would be infinite; an equisolid one is near 3.
-ALPHA_RANGE = (0.0, 4.0)
-# A column whose curvature cancels to less than this share in the elimination of the depths has none.
-MIN_CURVATURE = 1e-12
-# Single precision leaves errors of this size in the reduced system: less damping only makes it indefinite.
-MIN_DAMPING = {torch.float32: 1e-7, torch.float64: 1e-10}
 
 
 @dataclass(frozen=True, slots=True)

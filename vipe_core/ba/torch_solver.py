@@ -57,7 +57,8 @@ from vipe_core.ba.plan import Chunk, build_plan
 from vipe_core.ba.problem import Options, Problem, State
 from vipe_core.ba.reprojection import cameras_of, min_depth_factor
 from vipe_core.ba.rigs import extrinsic_prior, moved_poses, turns_of
-from vipe_core.ba.solver import ALPHA_RANGE, MAX_LOG_FOCAL_STEP, MIN_CURVATURE, Cost, Step
+from vipe_core.ba.rules import ALPHA_RANGE, MAX_LOG_FOCAL_STEP, MIN_CURVATURE
+from vipe_core.ba.solver import Cost, Step
 from vipe_core.cameras import projection
 from vipe_core.geometry import se3
 

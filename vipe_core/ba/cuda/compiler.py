@@ -15,10 +15,10 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
-from vipe_core.ba.cuda.context import CONTEXT_BYTES, CONTROL_BYTES
+from vipe_core.ba import rules
+from vipe_core.ba.cuda import context
 from vipe_core.ba.problem import RobustKernel
 from vipe_core.ba.robust import CODE
-from vipe_core.ba.solver import ALPHA_RANGE, MAX_LOG_FOCAL_STEP, MIN_CURVATURE
 
 logger = logging.getLogger(__name__)
 
@@ -26,6 +26,14 @@ _COMMON = ("context.cu", "pixel.cu")
 _SYSTEM = ("largest.cu", "reduce.cu", "factor.cu", "descent.cu")
 _TILE = ("tile.cu",)
 
+_SIZES = (
+    *("TILE", "SLICE", "TILE_THREADS", "EDGE_FLOATS", "TWIST_FLOATS", "SIDE_BLOCKS", "SIDE"),
+    *("FACTOR_THREADS", "WIDE_THREADS", "ASSEMBLE_BLOCKS", "CONTEXT_BYTES", "CONTROL_BYTES"),
+)
+_RULES = (
+    *("MAX_LOG_FOCAL_STEP", "MIN_CURVATURE", "MAX_DAMPING", "ACCEPTED_FACTOR", "REJECTED_FACTOR"),
+    *("NEGLIGIBLE_COST", "UNTRIED_SHARE", "TRUSTED_DAMPING", "NARROWING"),
+)
 SYSTEM_KERNELS = (
     *("begin", "widen", "transform", "largest", "fold", "turn", "assemble", "judge"),
     *("damp", "gather", "factorise", "substitute", "propose", "covariance", "finish"),
@@ -88,14 +96,9 @@ def tile_source(chosen: Iterable[Specialisation], *, numbered: bool = False) -> 
 
 def _constants() -> str:
     """What the kernels must not have another opinion of."""
-    constants = {
-        "CONTEXT_BYTES": CONTEXT_BYTES,
-        "CONTROL_BYTES": CONTROL_BYTES,
-        "MIN_CURVATURE": MIN_CURVATURE,
-        "MAX_LOG_FOCAL_STEP": MAX_LOG_FOCAL_STEP,
-        "MIN_ALPHA": ALPHA_RANGE[0],
-        "MAX_ALPHA": ALPHA_RANGE[1],
-    }
+    constants = {name: getattr(context, name) for name in _SIZES} | {name: getattr(rules, name) for name in _RULES}
+    constants["MIN_ALPHA"], constants["MAX_ALPHA"] = rules.ALPHA_RANGE
+    constants["SIGMA_DAMPINGS"] = ", ".join(map(str, rules.SIGMA_DAMPINGS))
     return "".join(f"#define {name} {value}\n" for name, value in constants.items())
 
 

@@ -1,8 +1,21 @@
-"""The argument of every kernel: sizes, settings and addresses, mirrored from `kernels/context.cu`."""
+"""What host and kernels must agree on: sizes, and the argument of every kernel.
+
+Sizes are defined for the kernels' compiler; the argument is mirrored from `kernels/context.cu`.
+"""
 
 from __future__ import annotations
 
 import ctypes
+
+# Cells that a block of threads handles at a time, and in all: sums are single precision over a slice, double across.
+TILE, SLICE, TILE_THREADS = 64, 256, 128
+# Numbers of an edge's transform and camera, and of its twist with the steps of the intrinsics of both its cameras.
+EDGE_FLOATS, TWIST_FLOATS = 20, 10
+# 6x6 blocks, and scalars, of the reduced system along a tile of its factor.
+SIDE_BLOCKS, SIDE = 8, 48
+FACTOR_THREADS, WIDE_THREADS = 256, 256
+# 6x6 blocks that a block of WIDE_THREADS works on, 36 threads each.
+ASSEMBLE_BLOCKS = 7
 
 _SIZES = (
     "num_frames num_edges num_cells width num_units num_slices num_nodes num_tail num_intrinsics num_blocks num_sides "

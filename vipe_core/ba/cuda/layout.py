@@ -17,16 +17,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vipe_core.ba import block_cholesky
+from vipe_core.ba.cuda.context import SIDE, SIDE_BLOCKS, SLICE, TILE, TILE_THREADS
 
 Ints = NDArray[np.int64]
 Array = NDArray[Any]
 
-# As in `kernels/context.cu` and `kernels/tile.cu`.
-TILE = 64
-SLICE = 256
-TILE_THREADS = 128
-SIDE_BLOCKS = 8
-SIDE = 6 * SIDE_BLOCKS
+# As in `kernels/tile.cu` and `kernels/context.cu`.
 _FIXED_FLOATS = 20 + 10 * TILE + 2 * TILE + TILE_THREADS // 32 * 4 * TILE
 _PRODUCT_STRIDE = {0: 32, 1: 40, 2: 48, 4: 72}
 

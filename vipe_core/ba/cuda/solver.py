@@ -18,31 +18,25 @@ from torch import Tensor
 
 from vipe_core.ba.answer import Answer, num_cameras, report_size
 from vipe_core.ba.cuda.compiler import Specialisation
-from vipe_core.ba.cuda.context import CONTROL_BYTES, Context
-from vipe_core.ba.cuda.launcher import Launch, Launcher
-from vipe_core.ba.cuda.layout import (
-    LARGE_SHARED_BYTES,
+from vipe_core.ba.cuda.context import (
+    ASSEMBLE_BLOCKS,
+    CONTROL_BYTES,
+    EDGE_FLOATS,
+    FACTOR_THREADS,
     SIDE,
     SLICE,
     TILE,
     TILE_THREADS,
-    Layout,
-    Tail,
-    Unknowns,
-    build_layout,
+    TWIST_FLOATS,
+    WIDE_THREADS,
+    Context,
 )
+from vipe_core.ba.cuda.launcher import Launch, Launcher
+from vipe_core.ba.cuda.layout import LARGE_SHARED_BYTES, Layout, Tail, Unknowns, build_layout
 from vipe_core.ba.problem import Options, Problem, State
 from vipe_core.ba.rigs import unknowns_of
 from vipe_core.ba.robust import CODE
-from vipe_core.ba.solver import MIN_DAMPING
-
-# As in `kernels/context.cu`.
-_EDGE_FLOATS = 20
-_TWIST_FLOATS = 10
-_WIDE_THREADS = 256
-_FACTOR_THREADS = 256
-_ASSEMBLE_BLOCKS = 7
-_COVARIANCE_ATTEMPTS = 3
+from vipe_core.ba.rules import MIN_DAMPING, SIGMA_DAMPINGS
 
 
 def specialisation(problem: Problem, state: State, options: Options) -> Specialisation:
@@ -120,9 +114,9 @@ class Adjustment:
             "depth": (single, (2, frames, cells)),
             "intrinsics": (double, (2, self._num_cameras, 5)),
             "view": (double, (2, self._num_views, 16)),
-            "edge_transform": (single, (2, count, _EDGE_FLOATS)),
+            "edge_transform": (single, (2, count, EDGE_FLOATS)),
             "edge_adjoint": (double, (count, 36)),
-            "edge_twist": (single, (count, _TWIST_FLOATS)),
+            "edge_twist": (single, (count, TWIST_FLOATS)),
             "pose_step": (double, (6 * frames + 2 * self._num_cameras,)),
             "partial": (single, (layout.partial_size,)),
             "scratch": (single, (large_blocks * layout.scratch_stride,)),
@@ -224,9 +218,9 @@ class Adjustment:
         first = options.initial_scale_px
         self._launch("begin", 1, 1)
         if first is not None and math.isinf(first):
-            self._launch("transform", self._edge_blocks, _WIDE_THREADS)
+            self._launch("transform", self._edge_blocks, WIDE_THREADS)
             self._launch("largest", len(self._problem.edges.source), TILE)
-            self._launch("widen", 1, _WIDE_THREADS)
+            self._launch("widen", 1, WIDE_THREADS)
         # Graduated non-convexity linearises anew where a level ended without a step, and once at the last scale.
         levels = max(options.max_iterations // 2, 1) + 1 if first is not None else 0
         for _ in range(options.max_iterations + levels):
@@ -234,15 +228,15 @@ class Adjustment:
             self._factorise(0)
             for level in reversed(range(self._levels)):
                 begin, end = layout.level_columns[level : level + 2]
-                self._launch("substitute", end - begin, _FACTOR_THREADS, begin)
-            self._launch("propose", 1, _WIDE_THREADS)
+                self._launch("substitute", end - begin, FACTOR_THREADS, begin)
+            self._launch("propose", 1, WIDE_THREADS)
         self._linearise()
-        for attempt in range(1, _COVARIANCE_ATTEMPTS + 1) if any(self._intrinsics_free) else ():
+        for attempt in range(1, len(SIGMA_DAMPINGS) + 1) if any(self._intrinsics_free) else ():
             self._factorise(attempt)
             self._launch("covariance", 1, 1, attempt)
         frames, cells = self._state.inverse_depth.shape
         copied = max(frames * cells, 16 * frames, 16 * self._num_views, 5 * self._num_cameras)
-        self._launch("finish", -(-copied // _WIDE_THREADS), _WIDE_THREADS)
+        self._launch("finish", -(-copied // WIDE_THREADS), WIDE_THREADS)
 
     def assemble(self, times: int) -> None:
         """Launch what a linearisation of the state given takes, so many times: to measure it."""
@@ -272,29 +266,29 @@ class Adjustment:
     def _linearise(self) -> None:
         layout = self._layout
         small = layout.num_units - layout.num_large
-        self._launch("transform", self._edge_blocks, _WIDE_THREADS)
+        self._launch("transform", self._edge_blocks, WIDE_THREADS)
         if layout.num_large:
             self._launch("tile_large", layout.num_large * self._slices, TILE_THREADS, 0, LARGE_SHARED_BYTES)
         if small:
             self._launch("tile", small * self._slices, TILE_THREADS, layout.num_large, layout.shared_bytes)
-        self._launch("fold", layout.num_units, _WIDE_THREADS)
+        self._launch("fold", layout.num_units, WIDE_THREADS)
         if self._num_views:
-            self._launch("turn", -(-layout.pool_size // _ASSEMBLE_BLOCKS), _WIDE_THREADS)
-        self._launch("assemble", -(-layout.num_blocks // _ASSEMBLE_BLOCKS), _WIDE_THREADS)
-        self._launch("judge", 1, _WIDE_THREADS)
+            self._launch("turn", -(-layout.pool_size // ASSEMBLE_BLOCKS), WIDE_THREADS)
+        self._launch("assemble", -(-layout.num_blocks // ASSEMBLE_BLOCKS), WIDE_THREADS)
+        self._launch("judge", 1, WIDE_THREADS)
 
     def _factorise(self, covariance: int) -> None:
         layout = self._layout
-        self._launch("damp", layout.num_tiles, _FACTOR_THREADS, covariance)
+        self._launch("damp", layout.num_tiles, FACTOR_THREADS, covariance)
         for level in range(self._levels):
             begin, end = layout.level_tiles[level : level + 2]
             if level:
-                self._launch("gather", end - begin, _FACTOR_THREADS, covariance, second=begin)
-            self._launch("factorise", end - begin, _FACTOR_THREADS, covariance, second=begin)
+                self._launch("gather", end - begin, FACTOR_THREADS, covariance, second=begin)
+            self._launch("factorise", end - begin, FACTOR_THREADS, covariance, second=begin)
 
     @property
     def _edge_blocks(self) -> int:
-        return -(-len(self._problem.edges.source) // _WIDE_THREADS)
+        return -(-len(self._problem.edges.source) // WIDE_THREADS)
 
     def _launch(
         self, kernel: str, blocks: int, threads: int, first: int = 0, shared_bytes: int = 0, *, second: int = 0

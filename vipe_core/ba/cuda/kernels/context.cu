@@ -12,29 +12,8 @@
 
 typedef long long i64;
 
-// Cells that one block handles at a time, and in all: sums are single precision over a slice, double across slices.
-#define TILE 64
-#define SLICE 256
-#define TILE_THREADS 128
+// Sizes, and the numbers that the descent decides by, are defined before (`compiler.py`).
 #define TILE_WARPS (TILE_THREADS / 32)
-// Numbers of an edge's transform and camera.
-#define EDGE_FLOATS 20
-// ... and of its twist, with the steps of the intrinsics of both its cameras.
-#define TWIST_FLOATS 10
-// Scalars of the reduced system per tile of its factor: eight blocks of six.
-#define SIDE 48
-#define SIDE_BLOCKS 8
-#define FACTOR_THREADS 256
-#define WIDE_THREADS 256
-#define ASSEMBLE_BLOCKS 7
-
-#define MAX_DAMPING 1e8
-#define ACCEPTED_FACTOR 0.2
-#define REJECTED_FACTOR 10.0
-#define NEGLIGIBLE_COST 1e-14
-#define UNTRIED_SHARE 0.1
-#define TRUSTED_DAMPING 1e-2
-#define NARROWING 1.4
 #define TINY 1.2e-38f
 // Of a report, before the covariances.
 #define REPORT_NUMBERS 5

@@ -4,11 +4,12 @@
 // the forward substitution. Columns of tiles are taken by levels: those of one level do not depend on each other, and
 // every tile first gathers what the columns before subtract from it, so no two blocks of threads write the same tile.
 //
-// `covariance` is 0 within the descent; 1, 2 or 3 factorise for the covariance of the intrinsics, by the least of three
+// `covariance` is 0 within the descent; 1, 2, ... factorise for the covariance of the intrinsics, by the least of several
 // dampings at which that is possible.
 
 __device__ inline double damping_of(const Control& control, int covariance) {
-    return covariance == 0 ? control.damping : covariance == 1 ? 1e-9 : covariance == 2 ? 1e-7 : 1e-5;
+    const double of_covariance[] = {SIGMA_DAMPINGS};
+    return covariance == 0 ? control.damping : of_covariance[covariance - 1];
 }
 
 __device__ inline bool nothing_to_factorise(const Control& control, int covariance) {
