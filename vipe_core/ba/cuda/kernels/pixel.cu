@@ -136,7 +136,8 @@ __device__ inline float rho(const Scale& scale, float s) {
     if constexpr (ROBUST == CAUCHY) return c2 * log1pf(s / c2);
     if constexpr (ROBUST == GEMAN_MCCLURE) return s * c2 / (c2 + s);
     if constexpr (ROBUST == TUKEY) {
-        const float inside = s < c2 ? 1.0f - s / c2 : s - s;  // not a number where s is not finite
+        float inside = 1.0f - s / c2;
+        inside = inside < 0.0f ? s - s : inside;  // not a number where s is not finite
         return c2 / 3.0f * (1.0f - inside * inside * inside);
     }
     if constexpr (ROBUST == TRUNCATED) {
