@@ -22,6 +22,7 @@ import cv2
 import numpy as np
 import torch
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
 from benchmarks.claimed_gpu import claimed_gpu
@@ -69,7 +70,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         table.add_column("where")
         for place, count in gpu.waits.most_common():
             if place.function.startswith(_SOLVER) == solver:
-                where = f"{place.function.removeprefix('vipe_core.')}\n  {place.line}"
+                where = f"{place.function.removeprefix('vipe_core.')}\n  {escape(place.line)}"
                 table.add_row(str(count), f"{count / frames:.1f}", f"{count / keyframes:.1f}", place.kind, where)
         console.print(table)
     return 0 if same else 1
