@@ -461,9 +461,9 @@ class Adjuster:
     def state(self, poses: Array, depths: Array, intrinsics: Array, cam_from_rig: Array | None = None) -> State:
         """Poses (N, 4, 4), inverse depths (N, P), intrinsics and extrinsics on the device."""
         return State(
-            cam_from_world=torch.from_numpy(np.ascontiguousarray(poses)).to(self.device),
-            inverse_depth=torch.from_numpy(np.ascontiguousarray(depths)).to(self.device),
-            intrinsics=torch.from_numpy(np.array(intrinsics, dtype=np.float64)).to(self.device),
+            cam_from_world=torch.from_numpy(np.ascontiguousarray(poses)).to(self.device, non_blocking=True),
+            inverse_depth=torch.from_numpy(np.ascontiguousarray(depths)).to(self.device, non_blocking=True),
+            intrinsics=torch.from_numpy(np.array(intrinsics, dtype=np.float64)).to(self.device, non_blocking=True),
             cam_from_rig=None if cam_from_rig is None else torch.from_numpy(cam_from_rig.copy()).to(self.device),
         )
 

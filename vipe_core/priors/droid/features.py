@@ -13,7 +13,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from vipe_core.ba.problem import Grid
-from vipe_core.priors.droid.network import DroidNetwork
+from vipe_core.priors.droid.network import DroidNetwork, uploaded
 from vipe_core.priors.protocols import WorkingFrame
 
 Array = NDArray[Any]
@@ -63,7 +63,7 @@ class DroidFeatures:
     def usable(self) -> Tensor:
         """(P,) float32, 1 on cells whose block may be used, on the network's device."""
         cells = np.ones(self.grid.num_cells, np.float32) if self.valid is None else usable_cells(self.valid)
-        return torch.from_numpy(cells).to(self._network.device)
+        return uploaded(torch.from_numpy(cells), self._network.device)
 
 
 def encoded(network: DroidNetwork, frames: list[WorkingFrame]) -> list[DroidFeatures]:

@@ -67,10 +67,9 @@ class DroidMatcher:
         """Mean length of the first correction of a standing picture, pixels (paper section 3.1, step 2)."""
         refinement, still = self._between([(source, target)])
         refined = refinement.update(still, [0])
-        usable = source.usable > 0
-        if not bool(usable.any()):
-            return 0.0
-        return float((refined.target_px[0] - still[0]).norm(dim=-1)[usable].mean())
+        length = (refined.target_px[0] - still[0]).norm(dim=-1)
+        # One number, read once: the host waits for the GPU here.
+        return float((length * source.usable).sum() / source.usable.sum().clamp(min=1))
 
     def match(self, source: DroidFeatures, target: DroidFeatures, guess_px: Array | None = None) -> tuple[Match, Match]:
         """Measurements source -> target and target -> source; see `DenseMatcher.match`."""
@@ -114,7 +113,7 @@ class DroidMatcher:
         size = _size_px(pairs[0][0].grid)
         found = []
         for (_, target), target_px, weight in zip(pairs, refined.target_px, refined.weight, strict=True):
-            inside = ((target_px >= 0) & (target_px <= target_px.new_tensor(size))).all(-1)
+            inside = (target_px >= 0).all(-1) & (target_px[:, 0] <= size[0]) & (target_px[:, 1] <= size[1])
             kept = weight * (inside * _sampled(target.usable, target_px, target.grid))[:, None]
             share = float((kept.amax(dim=-1) > 0.5).sum() / inside.sum().clamp(min=1))
             found.append(Match(target_px.cpu().numpy(), kept.cpu().numpy(), share))

@@ -75,7 +75,7 @@ class DroidNetwork(nn.Module):
     def normalised(self, pictures: Tensor) -> Tensor:
         """(B, 3, H, W) pictures for the encoders of uint8 ones (RGB)."""
         layout = torch.channels_last if self.device.type == "cuda" else torch.contiguous_format
-        wide = pictures.to(self.device, torch.float32).contiguous(memory_format=layout)
+        wide = uploaded(pictures, self.device).float().contiguous(memory_format=layout)
         return (wide / 255 - self._mean) / self._std
 
     def features(self, pictures: Tensor) -> Tensor:
@@ -128,3 +128,9 @@ class DroidNetwork(nn.Module):
 def _filled(given: Tensor, more: int) -> Tensor:
     """With so many more rows of zeros."""
     return functional.pad(given, (0, 0, 0, 0, 0, 0, 0, more)) if more else given
+
+
+def uploaded(tensor: Tensor, device: torch.device) -> Tensor:
+    """A tensor of the host on a device, without waiting for what runs there: memory that is not pinned is copied to
+    where the driver sends it from before this returns."""
+    return tensor.to(device, non_blocking=True)

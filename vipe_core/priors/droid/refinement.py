@@ -10,7 +10,7 @@ from torch import Tensor
 from vipe_core.ba.problem import Grid
 from vipe_core.priors.droid.correlation import Correlation, FeatureCorrelation, VolumeCorrelation
 from vipe_core.priors.droid.features import DroidFeatures
-from vipe_core.priors.droid.network import DroidNetwork
+from vipe_core.priors.droid.network import DroidNetwork, uploaded
 from vipe_core.priors.droid.update import shares
 from vipe_core.priors.protocols import Refined
 
@@ -63,7 +63,7 @@ class DroidRefinement:
         """See `Refinement.keep`."""
         if list(rows) == list(range(len(self))) or self._hidden is None or self._said is None:
             return
-        index = torch.tensor(list(rows), dtype=torch.int64, device=self._network.device)
+        index = uploaded(torch.tensor(list(rows), dtype=torch.int64), self._network.device)
         self._pairs = [self._pairs[row] for row in rows]
         self._hidden, self._said = self._hidden[index.to(self._home)], self._said[index]
         if self._correlation is not None:
@@ -76,13 +76,12 @@ class DroidRefinement:
         assert self._said is not None
         device = self._network.device
         seen = self._in_cells(seen_px)
-        numbers = torch.tensor(list(sources), dtype=torch.int64, device=device)
         said = torch.empty_like(self._said)
         weight = torch.empty_like(self._said)
         dampings = []
         correlation = self._correlated()
         for rows in self._parts(sources):
-            index = torch.tensor(rows, dtype=torch.int64, device=device)
+            index = uploaded(torch.tensor(rows, dtype=torch.int64), device)
             at_home = index.to(self._home)
             some = correlation if len(rows) == len(self) else correlation.kept(index)
             motion = torch.cat((seen[index] - self._cells, self._said[index] - seen[index]), dim=-1)
@@ -91,7 +90,7 @@ class DroidRefinement:
                 torch.stack([self._pairs[row][0].context[1] for row in rows]),
                 some.lookup(seen[index]).to(self._network.dtype),
                 motion.permute(0, 3, 1, 2),
-                shares(numbers[index])[1],
+                uploaded(shares([sources[row] for row in rows]), device),
             )
             # In place, part by part: the states of a large graph are most of what there is.
             hidden = updated.hidden.to(self._hidden.dtype).nan_to_num(0.0, 1.0, -1.0)
@@ -125,10 +124,8 @@ class DroidRefinement:
                 if features.index not in frames:
                     frames[features.index] = len(found)
                     found.append(features.found)
-            ends = torch.tensor(
-                [[frames[source.index], frames[target.index]] for source, target in self._pairs],
-                device=self._network.device,
-            )
+            ends = torch.tensor([[frames[source.index], frames[target.index]] for source, target in self._pairs])
+            ends = uploaded(ends, self._network.device)
             self._correlation = FeatureCorrelation.of(
                 torch.stack(found), ends[:, 0].contiguous(), ends[:, 1].contiguous()
             )

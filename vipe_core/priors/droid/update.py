@@ -6,8 +6,10 @@ A convolutional GRU per edge, and heads for the flow's correction, its weights, 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
@@ -113,11 +115,12 @@ class UpdateOperator(nn.Module):
         )
 
 
-def shares(sources: Tensor) -> tuple[Tensor, Tensor]:
-    """The source frames of edges in order (S,), and each edge's share (S, E) float32 in the mean of its source."""
-    frames, row, count = torch.unique(sources, sorted=True, return_inverse=True, return_counts=True)
-    one = functional.one_hot(row, len(frames)).T.float()
-    return frames, one / count[:, None]
+def shares(sources: Sequence[int]) -> Tensor:
+    """(S, E) float32 on the host: each edge's share in the mean of its source frame, those in increasing order."""
+    frames, row, count = np.unique(np.array(sources, np.int64), return_inverse=True, return_counts=True)
+    share = torch.zeros(len(frames), len(sources))
+    share[row, torch.arange(len(sources))] = torch.from_numpy((1 / count[row]).astype(np.float32))
+    return share
 
 
 def _head(

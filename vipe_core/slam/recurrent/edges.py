@@ -161,7 +161,8 @@ class RefinedEdges:
         """(E, P, 2) float32 where the map sees the source cells of edges; NaN where it does not."""
         frames = sorted({k for edge in pairs for k in edge})
         number = {k: row for row, k in enumerate(frames)}
-        ends = torch.tensor([[number[i], number[j]] for i, j in pairs], dtype=torch.int64, device=self._adjuster.device)
+        ends = torch.tensor([[number[i], number[j]] for i, j in pairs], dtype=torch.int64)
+        ends = ends.to(self._adjuster.device, non_blocking=True)
         keyframes = self._keyframes
         px, valid = reproject(keyframes.camera_model, keyframes.grid, self._state(frames), ends[:, 0], ends[:, 1])
         return torch.where(valid[..., None], px, torch.nan)
@@ -216,5 +217,5 @@ class RefinedEdges:
         self.active = [self.active[row] for row in rows]
         self._ages = [self._ages[row] for row in rows]
         if self._target_px is not None and self._weight is not None:
-            index = torch.tensor(rows, dtype=torch.int64, device=self._target_px.device)
+            index = torch.tensor(rows, dtype=torch.int64).to(self._target_px.device, non_blocking=True)
             self._target_px, self._weight = self._target_px[index], self._weight[index]
