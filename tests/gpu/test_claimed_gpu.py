@@ -115,6 +115,8 @@ def test_tracker_backend_and_infill_do_there_what_they_do_here(clip: Path, caplo
     assert (found.keyframes, found.edges) == (expected.keyframes, expected.edges)
     assert gpu.replays > 5
     assert not caplog.records
+    waiting = {place.function.removeprefix("vipe_core.priors.droid.") for place in gpu.waits}
+    assert not any(name.startswith(("refinement.", "update.", "correlation.", "graphs.")) for name in waiting)
     here, there = maps
     # To what half precision leaves of it.
     moved = np.abs(here.poses() - np.eye(4)).max()

@@ -21,6 +21,7 @@ from vipe_core.slam.keyframes import KeyframeMap
 from vipe_core.slam.recurrent.edges import RefinedEdges
 from vipe_core.slam.recurrent.linking import Reach, distances, links
 from vipe_core.slam.recurrent.settings import RefinementSettings
+from vipe_core.slam.recurrent.tracking import RefinedTracker
 from vipe_core.slam.selection import Keyframe
 from vipe_core.slam.settings import SlamSettings
 from vipe_core.slam.system import Slam, SlamResult
@@ -138,6 +139,33 @@ def test_edges_keep_their_measurements_when_they_retire_and_follow_the_numbers_o
     graph = Graph()
     edges.file(graph)
     assert list(graph) == [(3, 4)]
+
+
+def test_a_map_grows_in_the_memory_of_its_window_and_forgetting_changes_nothing() -> None:
+    poses = walk(26)
+    settings = replace(
+        SHORT, redundant_px=0.0, first_updates=1, updates=1, more_updates=1, oldest=4, window=6, recent=3
+    )
+
+    def grown() -> tuple[KeyframeMap, list[int]]:
+        refiner = RoomRefiner(poses)
+        keyframes = KeyframeMap(GRID, "pinhole", refiner.camera.index_params())
+        adjuster = Adjuster(SlamSettings(), torch.device("cpu"), FocalPrior(float(np.log(100.0)), 0.1), 1.0)
+        tracker = RefinedTracker(refiner, keyframes, adjuster, refiner.reprojector, settings, 0.2)
+        tracker.start([Keyframe(k, k) for k in range(4)], [k / 30 for k in range(4)])
+        stored = []
+        for k in range(4, 26):
+            tracker.add(Keyframe(k, k), k / 30)
+            stored.append(len(tracker._edges.stored))
+        return keyframes, stored
+
+    found, stored = grown()
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(RefinedEdges, "forget", lambda *_: None)
+        everything, all_stored = grown()
+    assert max(stored[12:]) <= max(stored[:12]) < 0.5 * all_stored[-1]
+    np.testing.assert_array_equal(found.poses(), everything.poses())
+    np.testing.assert_array_equal(found.depths(), everything.depths())
 
 
 def test_links_are_to_neighbours_and_to_the_nearest_others_at_a_distance_from_each_other() -> None:

@@ -78,6 +78,11 @@ class RefinedEdges:
         """Store the edges that were refined more than `oldest` times, or whose source is before `first_source`."""
         self._store(lambda row: self._ages[row] > oldest or self.active[row][0] < first_source)
 
+    def forget(self, first: int) -> None:
+        """Forget the stored edges that have an end before keyframe `first`: nothing asks for them any more."""
+        self.stored = {edge: said for edge, said in self.stored.items() if min(edge) >= first}
+        self._damping = {frame: said for frame, said in self._damping.items() if frame >= first}
+
     def remove_keyframe(self, k: int) -> None:
         """Forget the edges of keyframe `k`, whose number the next one takes."""
         self._select([row for row, edge in enumerate(self.active) if k not in edge])

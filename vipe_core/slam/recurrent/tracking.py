@@ -96,6 +96,10 @@ class RefinedTracker:
             keyframes.set_depth(count - 1, self._prior.expected([count - 1])[0])
         self._edges.retire(settings.oldest)
         self._link(range(max(count - settings.recent, 0), count), range(max(count - settings.window, 0), count))
+        # A map of any length is grown in the memory of its window: from here on, links start in the window, and what is
+        # not refined takes part up to `reused` keyframes before the edges that are.
+        oldest = min((min(edge) for edge in self._edges.active), default=count)
+        self._edges.forget(min(oldest, count - settings.window) - settings.reused - settings.window_gap - 1)
         self._refine(settings.updates)
         if count > 3:
             apart = distances(self._reprojector, keyframes, [(count - 3, count - 2)], settings)[0]
