@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
+from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -35,7 +38,9 @@ def pull(
     origin: Annotated[
         str | None,
         typer.Option(
-            "--from", help="Instead of the public address: an http(s) address of the file, a directory or s3:// mirror."
+            "--from",
+            help="Instead of the public address: an http(s) address or the path of the file, or a mirror, which is a"
+            " directory or s3://bucket/prefix.",
         ),
     ] = None,
     sha256: Annotated[str | None, typer.Option(help="What the checksum must be, where none is published.")] = None,
@@ -45,25 +50,49 @@ def pull(
 
     Where no checksum is published, that of the first pull is written down and every later one must agree.
     """
+    from rich.filesize import decimal
+
     from services.weights import pull as pull_weights
     from vipe_core.priors.weights import WEIGHTS, known, selected
 
     chosen = selected(names or WEIGHTS)
-    if (sha256 or (origin or "").startswith("http")) and len(chosen) != 1:
-        raise typer.BadParameter("an address or a checksum belongs to one name", param_hint="NAMES")
+    one_file = origin is not None and (origin.startswith(("http://", "https://")) or Path(origin).is_file())
+    if (sha256 or one_file) and len(chosen) != 1:
+        raise typer.BadParameter(
+            f"an address of a file or a checksum belongs to one file, here to one of: {', '.join(chosen)}",
+            param_hint="NAMES",
+        )
     for name in chosen:
         weights = known(name)
-        typer.echo(f"{name}: {weights.project}, licence {weights.licence}")
-        pulled = pull_weights(name, origin=origin, sha256=sha256, force=force)
+        typer.echo(f"{name}: {weights.project}, licence {weights.licence}, {decimal(weights.size_bytes)}")
+        with _bar(name) as progress:
+            pulled = pull_weights(name, origin=origin, sha256=sha256, force=force, progress=progress)
         what = "fetched" if pulled.fetched else "is here already"
         trust = ", trusted on first use: nobody has published a checksum" if pulled.first_use else ""
         typer.echo(f"{name}: {what}, {pulled.record.size_bytes} bytes, SHA-256 {pulled.record.sha256}{trust}")
 
 
+@contextlib.contextmanager
+def _bar(name: str) -> Iterator[Callable[[int, int | None], None]]:
+    """What shows how far a download is, on a terminal."""
+    from rich.console import Console
+    from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TimeRemainingColumn, TransferSpeedColumn
+
+    console = Console(stderr=True)
+    columns = (TextColumn("{task.description}"), BarColumn(), DownloadColumn(), TransferSpeedColumn())
+    with Progress(
+        *columns, TimeRemainingColumn(), console=console, transient=True, disable=not console.is_terminal
+    ) as bar:
+        task = bar.add_task(name, total=None)
+        yield lambda here, total: bar.update(task, completed=here, total=total)
+
+
 def verify(names: Names = None) -> None:
     """Compare checksums of the weights on this machine with the published ones, or those of the first pull."""
-    from vipe_core.priors.weights import WEIGHTS, expected_sha256, path_of, require, selected
+    from vipe_core.priors.weights import WEIGHTS, expected_sha256, path_of, require, selected, weights_folder
 
+    if not names and not any(path_of(name).is_file() for name in WEIGHTS):
+        typer.echo(f"there are no weights in {weights_folder()}")
     for name in selected(names) if names else [name for name in WEIGHTS if path_of(name).is_file()]:
         installed = require(name)
         known_by = "as it should be" if expected_sha256(name) else "nothing to compare it with: it was not pulled"

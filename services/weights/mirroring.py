@@ -8,7 +8,7 @@ from dataclasses import asdict
 
 from services.domain.errors import StorageError
 from services.storage import ObjectStore, open_store
-from vipe_core.priors.weights import Record, record_of, require, write_record
+from vipe_core.priors.weights import Record, known, record_of, require, write_record
 
 
 def mirror(names: Sequence[str], uri: str) -> list[str]:
@@ -31,9 +31,10 @@ def mirror(names: Sequence[str], uri: str) -> list[str]:
         if record is None:
             record = Record(installed.sha256, installed.path.stat().st_size, "found in place")
             write_record(name, record)
-        store.put_file(installed.path.name, installed.path)
-        store.put_bytes(_record_key(installed.path.name), (json.dumps(asdict(record), indent=1) + "\n").encode())
-        written.append(f"{store.uri}/{installed.path.name}")
+        file = known(name).file
+        store.put_file(file, installed.path)
+        store.put_bytes(_record_key(file), (json.dumps(asdict(record), indent=1) + "\n").encode())
+        written.append(f"{store.uri}/{file}")
     return written
 
 

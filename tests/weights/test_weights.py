@@ -4,18 +4,23 @@ from __future__ import annotations
 
 import hashlib
 import json
+import logging
+import socket
+import threading
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from http.server import BaseHTTPRequestHandler
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from typer.testing import CliRunner
 from web_server import Web, page, serve
 
 from services.cli.main import app
-from services.domain.errors import HttpFailed, ObjectMissing
-from services.weights import mirror, pull
+from services.domain.errors import HttpFailed, ObjectMissing, StorageError, StorageRefused
+from services.weights import fetching, mirror, pull
 from vipe_core.errors import WeightsInvalid, WeightsMissing
 from vipe_core.priors import weights as registry
 from vipe_core.priors.weights import checksum, path_of, record_of, require
@@ -138,6 +143,12 @@ def test_without_a_published_checksum_the_first_one_counts(web: Web, folder: Pat
     assert checksum(path_of("droid")) == SHA256
     with pytest.raises(WeightsInvalid):
         pull("droid", sha256="1" * 64)
+    with pytest.raises(WeightsInvalid, match="1" * 64):
+        pull("droid", origin=web.url("/droid.pth"), sha256="1" * 64, force=True)
+    # The user may know better than the first pull.
+    newer = hashlib.sha256(CONTENT + b"more").hexdigest()
+    assert pull("droid", origin=web.url("/droid.pth"), sha256=newer.upper(), force=True).record.sha256 == newer
+    assert require("droid").sha256 == newer
 
 
 def test_a_web_page_in_the_place_of_a_file_and_a_refusal_are_told_apart_from_weights(web: Web, folder: Path) -> None:
@@ -169,6 +180,79 @@ def test_a_mirror_serves_a_machine_without_internet(
         pull("droid", origin=str(tmp_path / "empty"), force=True)
 
 
+def test_the_files_of_a_network_keep_their_names_in_a_mirror(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    names = ("sam2_video/config.json", "sam2_video/model.safetensors", "depth_pro/model.safetensors")
+    for name in names:
+        path_of(name).parent.mkdir(parents=True, exist_ok=True)
+        path_of(name).write_text(name)
+    store = tmp_path / "mirror"
+    assert mirror(names, str(store)) == [f"{store}/{name}" for name in names]
+    monkeypatch.setenv("VIPE_WEIGHTS", str(tmp_path / "elsewhere"))
+    for name in names:
+        assert pull(name, origin=str(store)).path.read_text() == name
+
+
+def test_a_file_that_somebody_copied_here_is_taken_from_its_path(folder: Path, tmp_path: Path) -> None:
+    (tmp_path / "copied.pth").write_bytes(CONTENT)
+    pulled = pull("droid", origin=str(tmp_path / "copied.pth"))
+    assert (pulled.record.sha256, pulled.first_use) == (SHA256, True)
+    assert pulled.path.read_bytes() == CONTENT
+    assert (tmp_path / "copied.pth").exists()
+
+
+def test_of_two_pulls_at_once_one_waits_for_the_other(web: Web, folder: Path) -> None:
+    file, begun, waited = File(CONTENT), threading.Event(), threading.Event()
+
+    def slow(request: BaseHTTPRequestHandler) -> None:
+        begun.set()
+        assert waited.wait(30)
+        file(request)
+
+    class Waiting(logging.Handler):
+        def emit(self, record: logging.LogRecord) -> None:
+            if "waiting for it" in record.getMessage():
+                waited.set()
+
+    web.pages["/droid.pth"] = slow
+    waiting = Waiting()
+    logging.getLogger("services.weights.fetching").addHandler(waiting)
+    try:
+        with ThreadPoolExecutor(2) as pool:
+            first = pool.submit(pull, "droid", origin=web.url("/droid.pth"))
+            assert begun.wait(30)
+            second = pool.submit(pull, "droid", origin=web.url("/droid.pth"))
+            assert [first.result().fetched, second.result().fetched] == [True, False]
+    finally:
+        logging.getLogger("services.weights.fetching").removeHandler(waiting)
+    assert len(file.ranges) == 1
+    assert sorted(path.name for path in folder.iterdir()) == ["droid.pth", "droid.pth.json"]
+
+
+def test_what_a_disk_refuses_is_one_sentence(
+    web: Web, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    web.pages["/droid.pth"] = File(CONTENT)
+    with monkeypatch.context() as full:
+        full.setattr(fetching.shutil, "disk_usage", lambda path: SimpleNamespace(free=len(CONTENT) - 1))
+        with pytest.raises(StorageError, match=r"no room for droid\.pth .* VIPE_WEIGHTS"):
+            pull("droid", origin=web.url("/droid.pth"))
+    assert list(folder.iterdir()) == []
+    (tmp_path / "a_file").write_text("")
+    monkeypatch.setenv("VIPE_WEIGHTS", str(tmp_path / "a_file" / "weights"))
+    with pytest.raises(StorageRefused, match=r"cannot be used .* VIPE_WEIGHTS"):
+        pull("droid", origin=web.url("/droid.pth"))
+
+
+def test_without_a_network_the_way_around_it_is_named(web: Web, folder: Path) -> None:
+    with socket.socket() as unused:
+        unused.bind(("127.0.0.1", 0))
+        with pytest.raises(HttpFailed, match=r"cannot be reached .* --from"):
+            pull("droid", origin=f"http://127.0.0.1:{unused.getsockname()[1]}/droid.pth")
+    assert list(folder.iterdir()) == []
+
+
 def test_the_command_lists_pulls_verifies_and_mirrors(web: Web, folder: Path, tmp_path: Path) -> None:
     web.pages["/droid.pth"] = File(CONTENT)
 
@@ -179,6 +263,7 @@ def test_the_command_lists_pulls_verifies_and_mirrors(web: Web, folder: Path, tm
     code, text = vipectl("list")
     assert code == 0
     assert all(word in text for word in ("droid", "pose_only", "BSD-3-Clause", "not published"))
+    assert "there are no weights in" in vipectl("verify")[1]
     code, text = vipectl("verify", "droid")
     assert code == 1
     assert "weights_missing" in text
