@@ -25,7 +25,8 @@ setup: $(VENV)/.dev ## .venv with everything
 demo: $(VENV)/.runtime ## run the service on sample videos, or on VIDEO=clip.mp4
 	@$(VENV)/bin/vipectl demo $(if $(VIDEO),"$(VIDEO)")
 
-test: setup lint types unit ## everything that CI runs
+test: setup lint ## everything that CI runs
+	@$(MAKE) --no-print-directory --jobs=2 types unit
 
 test-long: setup ## what takes too long for CI
 	$(VENV)/bin/python -m pytest --numprocesses $(TEST_PROCESSES) --dist worksteal -m long $(PYTEST_ARGS)

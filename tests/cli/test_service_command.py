@@ -119,8 +119,8 @@ def test_a_job_from_s3_to_s3_survives_kill_9(
     exported = sorted((tmp_path / "npz").glob("*.npz"))
     assert len(exported) == 3
     with np.load(exported[0], allow_pickle=False) as arrays:
-        assert arrays["cam_to_world"].shape == (16, 4, 4)
-        assert arrays["depth"].shape == (16, 36, 48)
+        assert arrays["cam_to_world"].shape == (12, 4, 4)
+        assert arrays["depth"].shape == (12, 24, 32)
         assert str(arrays["depth_kind"]) == "z"
 
     metrics = httpx.get(f"http://127.0.0.1:{service.port}/metrics").text
@@ -135,7 +135,7 @@ def test_commands_of_a_running_service(service: Service, clip: Path, vipectl: Ru
     assert f"{job_id} succeeded" in done.stdout
     assert job_id in vipectl("jobs", *api).stdout
     assert '"videos_succeeded": 1' in vipectl("status", job_id, *api).stdout
-    assert "192x144" in vipectl("videos", job_id, *api).stdout
+    assert "128x96" in vipectl("videos", job_id, *api).stdout
     done = vipectl("cancel", job_id, *api)
     assert done.returncode == 1
     assert "job_not_cancellable" in done.stderr
@@ -153,7 +153,7 @@ def test_commands_of_a_running_service(service: Service, clip: Path, vipectl: Ru
     assert service.client.job(rigs)["state"] == "succeeded"
     report = verify(open_store(str(tmp_path / "rigs")), deep=True)
     assert report.ok, report.problems
-    assert (report.totals.videos, report.totals.frames) == (1, 32)
+    assert (report.totals.videos, report.totals.frames) == (1, 24)
     left, right = iterate(open_store(str(tmp_path / "rigs")))
     assert (left.row["view"], right.row["view"]) == ("left", "right")
     np.testing.assert_allclose(left.world_from_cam, right.world_from_cam, atol=1e-6)
@@ -163,7 +163,7 @@ def test_commands_of_a_running_service(service: Service, clip: Path, vipectl: Ru
     (pose,) = (tmp_path / "artifacts/pose").glob("*.npz")
     with np.load(pose) as arrays:
         assert arrays["data"].dtype == np.float32
-        assert arrays["inds"].tolist() == list(range(16))
+        assert arrays["inds"].tolist() == list(range(12))
 
     assert service.end(signal.SIGTERM) == 0
     with contextlib.suppress(httpx.TransportError):

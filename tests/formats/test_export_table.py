@@ -123,8 +123,8 @@ def test_colmap_and_our_reader_see_the_lens_that_was_given(
     again = read_calibration(out / "sparse/0/cameras.txt").camera
     assert again.model == CAMERAS[model].model
     np.testing.assert_allclose(again.params, CAMERAS[model].params, rtol=1e-12)
-    out = export_colmap(rooms[model], tmp_path / "b", voxel=0.4, step=8)
     pycolmap = pytest.importorskip("pycolmap", reason="pycolmap is not installed")
+    out = export_colmap(rooms[model], tmp_path / "b", voxel=0.4, step=8)
     model_read = pycolmap.Reconstruction(str(out / "sparse/0"))
     (lens,) = model_read.cameras.values()
     point = np.array([0.31, -0.22, 1.0])

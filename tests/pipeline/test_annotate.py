@@ -47,7 +47,7 @@ def annotator() -> Annotator:
 
 @pytest.fixture(scope="session")
 def orbit() -> SyntheticClip:
-    return tiny_clip("orbit", num_frames=20)
+    return tiny_clip("orbit", num_frames=16)
 
 
 @pytest.fixture(scope="session")
@@ -63,7 +63,7 @@ def orbit_annotation(annotator: Annotator, orbit_folder: Path) -> Annotation:
 @pytest.fixture(scope="session")
 def small() -> SyntheticClip:
     """Enough for every stage, where accuracy is not the question."""
-    return tiny_clip("orbit", 20, 192, 144, noise=1.0)
+    return tiny_clip("orbit", 14, 192, 144, noise=1.0)
 
 
 @pytest.fixture(scope="session")
@@ -79,7 +79,7 @@ def test_orbit_is_recovered(orbit: SyntheticClip, orbit_annotation: Annotation) 
     assert orbit_annotation.camera.fov_x_deg == pytest.approx(orbit.camera.fov_x_deg, abs=3.0)
     assert (orbit_annotation.camera.width, orbit_annotation.camera.height) == (320, 240)
     assert orbit_annotation.quality.reliable != "no"
-    assert orbit_annotation.num_frames == 20
+    assert orbit_annotation.num_frames == 16
 
 
 def test_dense_depth_has_the_scale_of_the_trajectory(orbit: SyntheticClip, orbit_annotation: Annotation) -> None:
@@ -126,7 +126,7 @@ def test_progress_goes_through_the_stages_and_can_cancel(annotator: Annotator, s
 
 @pytest.mark.parametrize(("kind", "reason"), [("static", "static_camera"), ("pure_rotation", "pure_rotation")])
 def test_cameras_that_do_not_travel_say_so(annotator: Annotator, folder: Folder, kind: ClipKind, reason: str) -> None:
-    clip = tiny_clip(kind, 16, 192, 144, noise=1.0)
+    clip = tiny_clip(kind, 12, 192, 144, noise=1.0)
     annotation = annotator.annotate(folder(clip.rgb, kind))
     assert reason in annotation.quality.reasons
     assert annotation.quality.reliable == "doubtful"
@@ -200,7 +200,7 @@ def test_black_frames_at_an_end_are_passed_over(
     annotator: Annotator, folder: Folder, small: SyntheticClip, turn: str
 ) -> None:
     rgb = small.rgb.copy()
-    black = np.arange(20) < 6 if turn == "fade in" else np.arange(20) >= 14
+    black = np.arange(14) < 4 if turn == "fade in" else np.arange(14) >= 10
     rgb[black] = 0
     annotation = annotator.annotate(folder(rgb, turn.replace(" ", "-")))
     truth, found = small.world_from_cam[~black, :3, 3], annotation.world_from_cam[~black, :3, 3]

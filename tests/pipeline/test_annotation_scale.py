@@ -29,7 +29,7 @@ from vipe_core.video import open_source
 
 @pytest.fixture(scope="module")
 def clip() -> SyntheticClip:
-    return tiny_clip("orbit", 20, 192, 144, noise=1.0)
+    return tiny_clip("orbit", 12, 192, 144, noise=1.0)
 
 
 @pytest.fixture(scope="module")
@@ -116,7 +116,7 @@ def test_video_depth_is_aligned_where_the_preset_has_it(
     annotation = Annotator(replace(resolve("classical"), depth="test.video")).annotate(folder)
     assert annotation.world_from_cam.tobytes() == relative.world_from_cam.tobytes()
     frames = list(annotation.dense())
-    assert [frame.index for frame in frames] == list(range(20))
+    assert [frame.index for frame in frames] == list(range(12))
     scale = depth_ratio(relative, clip)
     level = [np.median(np.log(frame.depth / clip.depth[frame.index])) - math.log(scale) for frame in frames]
     # The scale of the poses, without a jump: a small picture leaves the map a few per cent.

@@ -166,12 +166,12 @@ def pale(rgb: Array) -> Array:
     ("spoil", "lost", "limit"),
     [
         (flashed, [12, 17], 0.01),
-        (blacked, [9, 10, 11, 12], 0.01),
-        (brightened, [], 0.01),
+        pytest.param(blacked, [9, 10, 11, 12], 0.01, marks=pytest.mark.long),
+        pytest.param(brightened, [], 0.01, marks=pytest.mark.long),
         (flickering, [], 0.015),
         (blurred, [], 0.015),
-        (letterboxed, [], 0.015),
-        (pale, [], 0.015),
+        pytest.param(letterboxed, [], 0.015, marks=pytest.mark.long),
+        pytest.param(pale, [], 0.015, marks=pytest.mark.long),
     ],
 )
 def test_pictures_that_are_spoilt_leave_the_path_right(

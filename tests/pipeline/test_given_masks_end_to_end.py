@@ -43,6 +43,7 @@ def masked(images: Path, masks: Path) -> Annotation:
     return vipe_core.annotate(images, masks=masks)
 
 
+@pytest.mark.long
 def test_true_masks_do_the_path_no_harm(clip: SyntheticClip, images: Path, masked: Annotation) -> None:
     plain = vipe_core.annotate(images)
     without = trajectory_errors(plain.world_from_cam, clip.world_from_cam).ate_percent

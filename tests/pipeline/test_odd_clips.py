@@ -108,8 +108,12 @@ def annotator() -> Annotator:
     return Annotator()
 
 
+# Of these, `test_degenerate.py` or another of them is the like.
+ALIKE = {"portrait", "huge", "three frames", "white", "grey", "flashes", "repeats", "a cut", "240 frames a second"}
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ODD)
+@pytest.mark.parametrize("name", [pytest.param(n, marks=[pytest.mark.long] * (n in ALIKE)) for n in ODD])
 def test_an_odd_clip_has_finite_poses_and_positive_depth(annotator: Annotator, tmp_path: Path, name: str) -> None:
     odd = ODD[name]
     path = tmp_path / "odd.mkv"

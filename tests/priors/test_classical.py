@@ -238,7 +238,7 @@ def orbit(room: BoxRoom, count: int) -> list[WorkingFrame]:
     return [frame(room.render(p)[0], k) for k, p in enumerate(poses)]
 
 
-@pytest.mark.parametrize("fov_deg", [45.0, 70.0])
+@pytest.mark.parametrize("fov_deg", [pytest.param(45.0, marks=pytest.mark.long), 70.0])
 def test_focal_is_recovered_and_sure(fov_deg: float) -> None:
     frames = orbit(BoxRoom(fov_x_deg=fov_deg), 14)
     estimate = CombinedFocalInit((TwoViewFocal(),)).estimate(frames, grid_of(frames[0].gray))

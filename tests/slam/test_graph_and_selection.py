@@ -8,7 +8,7 @@ from collections.abc import Generator, Sequence
 import numpy as np
 import pytest
 import torch
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
@@ -185,6 +185,7 @@ def test_a_camera_that_stands_still_has_one_keyframe() -> None:
     assert indices(selection)[0] == 0
 
 
+@settings(max_examples=30)
 @given(count=st.integers(1, 700), capacity=st.integers(2, 64))
 def test_the_sample_is_bounded_and_evenly_spaced(count: int, capacity: int) -> None:
     sample = [frame.index for frame in select([0.0] * count, sample_frames=capacity).sample]

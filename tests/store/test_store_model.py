@@ -221,7 +221,7 @@ def test_the_store_is_the_model(store: SqlStore, store_url: str) -> None:
     run_state_machine_as_test(
         OnThisDatabase,
         settings=settings(
-            max_examples=25,
+            max_examples=12,
             stateful_step_count=25,
             deadline=None,
             derandomize=True,
