@@ -76,6 +76,7 @@ class ClaimedGpu(TorchFunctionMode):
         copies: Uploads that the host does not wait for.
         operations: Operations on tensors of it.
         replays: Of captured graphs.
+        forbidden: Whether a wait is an error, as `torch.cuda.set_sync_debug_mode("error")` makes it.
         recording: What a graph that is being captured is to do, else None.
         operators: Operators that are not torch's own -> what their kernel for CUDA is.
     """
@@ -86,6 +87,7 @@ class ClaimedGpu(TorchFunctionMode):
         self.copies = 0
         self.operations = 0
         self.replays = 0
+        self.forbidden = False
         self.recording: list[Callable[[], None]] | None = None
         self.operators = operators or {}
 
@@ -93,9 +95,11 @@ class ClaimedGpu(TorchFunctionMode):
         """Count a wait of the host.
 
         Raises:
-            RuntimeError: A graph is being captured.
+            RuntimeError: A graph is being captured, or waits are forbidden.
         """
         self._refuse_in_capture(kind)
+        if self.forbidden:
+            raise RuntimeError(f"called a synchronizing CUDA operation ({kind})")
         self.waits[_place(kind)] += 1
 
     def up(self, tensor: Tensor, dtype: torch.dtype | None = None, *, non_blocking: bool = False) -> ClaimedTensor:

@@ -95,6 +95,9 @@ def stand_ins(gpu: ClaimedGpu) -> Iterator[None]:
     def synchronize(_: Any = None) -> None:
         gpu.wait("synchronise")
 
+    def forbid(mode: int | str) -> None:
+        gpu.forbidden = mode in (2, "error")
+
     only = Stream()
     properties = SimpleNamespace(
         name=_NAME, total_memory=_MEMORY_BYTES, major=_CAPABILITY[0], minor=_CAPABILITY[1], multi_processor_count=132
@@ -136,6 +139,7 @@ def stand_ins(gpu: ClaimedGpu) -> Iterator[None]:
         "device": chosen,
         "device_of": chosen,
         "synchronize": synchronize,
+        "set_sync_debug_mode": forbid,
         **{name: _answering(answer) for name, answer in answers.items()},
         **{name: _answering(None) for name in quiet},
     }

@@ -66,6 +66,9 @@ def test_what_makes_the_host_wait_is_counted() -> None:
         _ = there[there > 0], there.unique(), there.nonzero()
         assert kinds(gpu) == ["shape"] * 3
         (place,) = {place.function for place in gpu.waits}
+        torch.cuda.set_sync_debug_mode("error")
+        with pytest.raises(RuntimeError, match="synchronizing"):
+            there.sum().item()
         assert place.endswith("test_what_makes_the_host_wait_is_counted")
 
 

@@ -115,9 +115,16 @@ class DroidMatcher:
         for (_, target), target_px, weight in zip(pairs, refined.target_px, refined.weight, strict=True):
             inside = (target_px >= 0).all(-1) & (target_px[:, 0] <= size[0]) & (target_px[:, 1] <= size[1])
             kept = weight * (inside * _sampled(target.usable, target_px, target.grid))[:, None]
-            share = float((kept.amax(dim=-1) > 0.5).sum() / inside.sum().clamp(min=1))
-            found.append(Match(target_px.cpu().numpy(), kept.cpu().numpy(), share))
-        return found
+            found.append(torch.cat((target_px, kept, inside[:, None]), dim=-1))
+        # All of it is read at once: the host waits for the GPU here.
+        return [_matched(one) for one in torch.stack(found).cpu().numpy()]
+
+
+def _matched(found: Array) -> Match:
+    """Of (P, 5): target (x, y), weights, and whether it is inside; what the network is sure of is its share."""
+    weight, inside = found[:, 2:4].copy(), found[:, 4].sum()
+    sure = np.count_nonzero(weight.max(axis=1) > 0.5)
+    return Match(found[:, :2].copy(), weight, float(sure / max(inside, 1.0)))
 
 
 def _checked(forward: Match, backward: Match, grid: Grid) -> Match:
