@@ -114,7 +114,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     console.print(f"device: {torch.cuda.get_device_name(device) if on_gpu else 'cpu'}, torch {torch.__version__}")
     _print_plan(console, settings, width, height, frames // every + 1, device)
     with tempfile.TemporaryDirectory(prefix="vipe-gpu-") as folder:
-        video = _clip(Path(folder) / "clip.mp4", frames, width, height)
+        video = moving_clip(Path(folder) / "clip.mp4", frames, width, height)
         workload = Workload(video, every, str(device), settings)
         table = Table(title=f"{frames} frames of {width}x{height}, random weights, a fixed schedule")
         for heading in ("whose", "videos at once", "frames/s", "wall s", "GB at most", "keyframes", "edges"):
@@ -270,7 +270,7 @@ def _annotate(workload: Workload, network: DroidNetwork, frames: int | None = No
     return Run(count, len(built), len(graph), clock.seconds, max(clock.peak_bytes.values(), default=0))
 
 
-def _clip(path: Path, frames: int, width: int, height: int) -> Path:
+def moving_clip(path: Path, frames: int, width: int, height: int) -> Path:
     """A smooth random picture that the camera pans over."""
     rng = np.random.default_rng(_SEED)
     coarse = torch.from_numpy(rng.uniform(0, 255, (1, 3, height // 8 + 2, width // 8 + frames // 4 + 2)))

@@ -206,6 +206,24 @@ def test_masked_cells_have_no_weight_and_a_pair_can_be_matched_without_geometry(
     assert not matcher.is_blank(matcher.encode(first))
 
 
+def test_motion_of_a_batch_is_asked_at_once_until_a_keyframe_is_taken(
+    network: DroidNetwork, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    matcher = DroidMatcher(network)
+    frames = [working(seed, index=seed) for seed in range(5)]
+    alone = {
+        (i, j): matcher.motion_px(matcher.encode(frames[i]), matcher.encode(frames[j]))
+        for i, j in [(0, 1), (0, 2), (0, 3), (3, 4)]
+    }
+    step, edges = network.step, list[int]()
+    monkeypatch.setattr(network, "step", lambda hidden, *rest: edges.append(len(hidden)) or step(hidden, *rest))
+    features = matcher.encode_batch(frames)
+    together = {(i, j): matcher.motion_px(features[i], features[j]) for i, j in alone}
+    assert together == pytest.approx(alone, rel=1e-4)
+    assert edges == [4, 1]
+    assert matcher.motion_px(features[2], features[1]) != pytest.approx(alone[0, 1], rel=1e-3)
+
+
 def public_checkpoint(network: DroidNetwork) -> dict[str, torch.Tensor]:
     """As the public file has it: the prefix of parallel training, and a third output of two heads."""
     found = {f"module.{name}": tensor.clone() for name, tensor in network.state_dict().items()}

@@ -14,7 +14,7 @@ from vipe_core.ba.problem import Grid
 from vipe_core.priors.classical.features import FlowFeatures
 from vipe_core.priors.classical.flow import DisFlowMatcher
 from vipe_core.priors.droid.features import OFFSET_PX, STRIDE, DroidFeatures, encoded
-from vipe_core.priors.droid.network import DroidNetwork
+from vipe_core.priors.droid.network import FRAME_STEP, DroidNetwork
 from vipe_core.priors.droid.refinement import DroidRefinement
 from vipe_core.priors.protocols import Match, WorkingFrame
 
@@ -23,6 +23,9 @@ Array = NDArray[Any]
 # Updates of a match that no bundle adjustment takes part in.
 _UPDATES = 8
 _FAST_UPDATES = 4
+# Frames whose motion is asked of the network at once. Captured shapes are padded to as many sources: no more work than
+# for one frame.
+_MOTIONS = FRAME_STEP
 # A cell whose forward and backward flows disagree by more than this many pixels and this share of the flow is wrong.
 _CONSISTENT_PX = 2.0
 _CONSISTENT_RATIO = 0.05
@@ -45,6 +48,8 @@ class DroidMatcher:
         self.batch_frames = 1 if on_host else 16
         self.bytes_per_px = 4 + 128 * (4 if on_host else 2) / STRIDE**2
         self._blank = DisFlowMatcher()
+        self._batch: list[DroidFeatures] = []
+        self._motions_px: dict[tuple[int, int], float] = {}
 
     @property
     def offset_px(self) -> float:
@@ -57,19 +62,30 @@ class DroidMatcher:
 
     def encode_batch(self, frames: Sequence[WorkingFrame]) -> list[DroidFeatures]:
         """Features of frames of one size."""
-        return encoded(self._network, list(frames))
+        self._batch, self._motions_px = encoded(self._network, list(frames)), {}
+        return list(self._batch)
 
     def is_blank(self, features: DroidFeatures) -> bool:
         """Whether the picture holds nothing to match: as the classical family judges it, by its structure."""
         return self._blank.is_blank(FlowFeatures(features.index, features.gray, features.valid, features.grid))
 
     def motion_px(self, source: DroidFeatures, target: DroidFeatures) -> float:
-        """Mean length of the first correction of a standing picture, pixels (paper section 3.1, step 2)."""
-        refinement, still = self._between([(source, target)])
-        refined = refinement.update(still, [0])
-        length = (refined.target_px[0] - still[0]).norm(dim=-1)
-        # One number, read once: the host waits for the GPU here.
-        return float((length * source.usable).sum() / source.usable.sum().clamp(min=1))
+        """Mean length of the first correction of a standing picture, pixels (paper section 3.1, step 2).
+
+        The frames that were encoded with `target` and come after it are asked for, too, since they will be asked about
+        unless one before them becomes a keyframe: the host waits for the GPU a few times a batch and not once a frame.
+        """
+        asked = source.index, target.index
+        if asked not in self._motions_px:
+            place = next((k for k, features in enumerate(self._batch) if features is target), None)
+            targets = [target] if place is None else self._batch[place : place + _MOTIONS]
+            refinement, still = self._between([(source, features) for features in targets])
+            refined = refinement.update(still, range(len(targets)))
+            lengths = (refined.target_px - still).norm(dim=-1)
+            # Read at once: the host waits for the GPU here.
+            mean = ((lengths * source.usable).sum(dim=-1) / source.usable.sum().clamp(min=1)).tolist()
+            self._motions_px = {(source.index, f.index): px for f, px in zip(targets, mean, strict=True)}
+        return self._motions_px[asked]
 
     def match(self, source: DroidFeatures, target: DroidFeatures, guess_px: Array | None = None) -> tuple[Match, Match]:
         """Measurements source -> target and target -> source; see `DenseMatcher.match`."""

@@ -19,7 +19,7 @@ FEATURES = 128
 _MEAN = (0.485, 0.456, 0.406)
 _STD = (0.229, 0.224, 0.225)
 # Edges and frames come in multiples of these where graphs are captured: few shapes, which repeat.
-_EDGE_STEP, _FRAME_STEP = 16, 8
+_EDGE_STEP, FRAME_STEP = 16, 8
 # Motion beyond this many cells is not told apart.
 _MAX_MOTION = 64.0
 
@@ -102,7 +102,7 @@ class DroidNetwork(nn.Module):
             frames, edges = share.shape
             more = -edges % _EDGE_STEP
             filled = [_filled(given, more) for given in (hidden, context, correlation, motion)]
-            share = functional.pad(share, (0, more, 0, -frames % _FRAME_STEP))
+            share = functional.pad(share, (0, more, 0, -frames % FRAME_STEP))
             state, delta, weight, damping = self._graphs(*filled, share)
             return Updated(state[:edges], delta[:edges], weight[:edges], damping[:frames])
 
