@@ -39,7 +39,13 @@ lint: setup
 types: setup
 	$(VENV)/bin/mypy
 
-unit: setup
+# Before the tests, which would compile the same kernels in several processes at once.
+KERNELS := $(shell grep -rl --include='*.py' 'vipe_core.compilation import' vipe_core)
+$(VENV)/.warm: $(VENV)/.dev $(KERNELS)
+	$(VENV)/bin/vipectl warmup
+	@touch $@
+
+unit: setup $(VENV)/.warm
 	$(VENV)/bin/python -m pytest --numprocesses $(TEST_PROCESSES) --dist worksteal $(PYTEST_ARGS)
 
 SEED ?= 1

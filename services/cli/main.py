@@ -9,7 +9,7 @@ from typing import Annotated, ParamSpec, TypeVar
 
 import typer
 
-from services.cli import annotate, data, demo, evaluate, export, gallery, jobs, keys, models, serve, tenants
+from services.cli import annotate, data, demo, evaluate, export, gallery, jobs, keys, models, serve, tenants, warmup
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -84,6 +84,7 @@ _COMMANDS: dict[str, Callable[..., None]] = {
     "unpack": data.unpack,
     "export": export.export,
     "gallery": gallery.gallery,
+    "warmup": warmup.warmup,
 }
 for _name, _command in _COMMANDS.items():
     app.command(_name)(_typed_errors(_command))

@@ -90,3 +90,18 @@ def test_what_is_not_offered_is_refused_with_what_is(
     assert f"[{code}]" in done.stderr
     assert hint in done.stderr
     assert "Traceback" not in done.stderr
+
+
+@pytest.mark.long
+def test_after_a_warmup_nothing_is_left_to_compile(
+    vipectl: Run, clip: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    cache = tmp_path / "cache"
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(cache))
+    done = vipectl("warmup")
+    assert done.returncode == 0, done.stderr
+    assert "ready: classical on cpu" in done.stdout
+    compiled = sorted(path.name for path in cache.rglob("*.nbc"))
+    assert len(compiled) > 20
+    assert vipectl("annotate", clip, "-o", "out").returncode == 0
+    assert sorted(path.name for path in cache.rglob("*.nbc")) == compiled
