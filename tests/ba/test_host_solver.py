@@ -86,7 +86,7 @@ def assert_same(problem: Problem, state: State, options: Options, damping: float
     assert held[~problem.free.inverse_depth].all()
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=25, deadline=None)
 @given(problems(), st.sampled_from(KERNELS), st.sampled_from([0.2, 3.0]), st.sampled_from([1e-3, 0.1, 10.0]))
 def test_any_problem_gives_the_step_of_the_torch_solver(
     drawn: tuple[Problem, State], robust: RobustKernel, scale_px: float, damping: float

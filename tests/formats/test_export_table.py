@@ -59,8 +59,14 @@ def test_the_table_knows_every_format() -> None:
     assert set(EXPORTS) == set(FORMATS)
 
 
-# A rational distortion is an opencv camera to all but the formats that have no place for its last coefficients.
-PAIRS = [(name, model) for model in CAMERAS for name in EXPORTS if model != "rational" or name in FOLDERS[1:3]]
+# A rational distortion is an opencv camera to all but the formats that have no place for its last coefficients. A
+# fisheye is one to those that describe no lens.
+PAIRS = [
+    pytest.param(name, model, marks=[pytest.mark.long] * (model == "opencv_fisheye" and name not in FOLDERS))
+    for model in CAMERAS
+    for name in EXPORTS
+    if model != "rational" or name in FOLDERS[1:3]
+]
 
 
 @pytest.mark.parametrize(("name", "model"), PAIRS)

@@ -94,6 +94,7 @@ def test_dense_depth_has_the_scale_of_the_trajectory(orbit: SyntheticClip, orbit
     assert orbit_annotation.timings_s["depth"] > 0
 
 
+@pytest.mark.long
 def test_two_runs_give_the_same_bytes(annotator: Annotator, folder: Folder, small_folder: Path) -> None:
     first = annotator.annotate(small_folder)
     # Another size in between: nothing of one video may reach the next.
