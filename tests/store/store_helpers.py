@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from services.domain.models import CommitRecord, JobSpec, Lease, ShardPlan, VideoRef, VideoResult
+from services.domain.models import CommitRecord, JobSpec, Lease, LeaseProgress, ShardPlan, VideoRef, VideoResult
 from services.domain.states import VideoStatus
 from services.store.base import Store
 
@@ -68,3 +68,13 @@ def record(
         ),
         retry=lease.retry,
     )
+
+
+def kinds(store: Store, job_id: str) -> list[str]:
+    return [e.kind for e in store.events(job_id)]
+
+
+def run_out(store: Store, *, holder: str, shard_id: str, fence: int) -> None:
+    """Let a lease run out without waiting: a renewal for no time at all."""
+    assert store.renew(holder, [LeaseProgress(fence, shard_id)], ttl_s=0)[0].verdict != "lost"
+    assert store.expire_leases() == 1
