@@ -19,13 +19,14 @@ from pathlib import Path
 from rich.console import Console
 from rich.table import Table
 
-from benchmarks.cpu_time import Measured, measure, warm_up
+from benchmarks.cpu_time import Measured, measure
 from benchmarks.peers.colmap import ColmapRun, ColmapSettings, run_colmap
 from benchmarks.sequences import DATA, BenchSequence, find_sequence
 from vipe_core.cameras import Camera
 from vipe_core.errors import VipeError
 from vipe_core.evaluation.truth import Estimate, SequenceReport, evaluate, read_truth
 from vipe_core.pipeline.annotator import Annotator
+from vipe_core.pipeline.warmup import warm_up
 
 _DEFAULT = ("room_tour",)
 

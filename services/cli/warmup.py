@@ -9,7 +9,8 @@ from typing import Annotated
 
 import typer
 
-_FRAMES, _WIDTH, _HEIGHT = 14, 192, 144
+_TOO_FEW = 64
+"""Points of a cloud or blocks of a mesh: what coarsens a scene that outgrows its memory is compiled as well."""
 
 
 def warmup(
@@ -22,22 +23,19 @@ def warmup(
     NUMBA_CACHE_DIR (default: beside the package) and, of CUDA kernels, in XDG_CACHE_HOME. It is for this kind of CPU
     and GPU and this version.
     """
-    from vipe_core.evaluation.synthetic import tiny_clip
     from vipe_core.formats import read_artifacts, write_artifacts
     from vipe_core.formats.fused import fuse_cloud, fuse_mesh
     from vipe_core.pipeline.annotator import Annotator
-    from vipe_core.video.encode import VideoWriter
+    from vipe_core.pipeline.warmup import warm_up
+    from vipe_core.rendering.overview import write_overview
 
     annotator = Annotator(preset, device=device)
     started_s = time.perf_counter()
     with tempfile.TemporaryDirectory(prefix="vipe-warmup-") as folder:
-        clip = tiny_clip("dynamic", _FRAMES, _WIDTH, _HEIGHT, noise=1.0)
-        video = Path(folder) / "clip.mp4"
-        with VideoWriter(video, clip.fps) as writer:
-            for rgb in clip.rgb:
-                writer.write(rgb)
-        write_artifacts(annotator.annotate(video), Path(folder) / "out")
-        artifacts = read_artifacts(Path(folder) / "out", "clip")
-        fuse_cloud(artifacts, voxel=0.1)
-        fuse_mesh(artifacts, voxel=0.1)
+        write_artifacts(warm_up(annotator, Path(folder)), Path(folder) / "out")
+        if annotator.preset.makes_depth:
+            artifacts = read_artifacts(Path(folder) / "out", "clip")
+            fuse_cloud(artifacts, max_points=_TOO_FEW)
+            fuse_mesh(artifacts, max_blocks=_TOO_FEW)
+            write_overview(artifacts, Path(folder) / "overview.jpg")
     typer.echo(f"ready: {preset} on {device}, {time.perf_counter() - started_s:.0f} s")
