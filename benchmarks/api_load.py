@@ -23,14 +23,12 @@ import time
 from collections import Counter, defaultdict
 from collections.abc import Awaitable, Callable, Iterator
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 import httpx
 
+from benchmarks.processes import cpu_s_of, resident_bytes
 from services.store.sql import SqlStore
-
-_TICKS_PER_S = os.sysconf("SC_CLK_TCK")
 
 
 @dataclass
@@ -153,16 +151,6 @@ def server(database_url: str, data_dir: str) -> Iterator[tuple[int, int]]:
         process.wait()
 
 
-def memory_mib(pid: int) -> float:
-    (line,) = (line for line in Path(f"/proc/{pid}/status").read_text().splitlines() if line.startswith("VmRSS"))
-    return int(line.split()[1]) / 1024
-
-
-def cpu_s(pid: int) -> float:
-    fields = Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()
-    return (int(fields[11]) + int(fields[12])) / _TICKS_PER_S
-
-
 def report(title: str, load: Load, seconds: float, server_cpu_s: float) -> float:
     """Print a phase; gives the server's CPU milliseconds per request."""
     per_request_ms = 1e3 * server_cpu_s / max(load.requests, 1)
@@ -194,23 +182,23 @@ def main() -> None:
         keys = [store.create_key(f"client {i}", tenant=f"load-{i % args.tenants}")[1] for i in range(args.clients)]
         store.close()
         with server(database_url, folder) as (port, pid):
-            memory = {"start": memory_mib(pid)}
-            before = cpu_s(pid)
+            memory = {"start": resident_bytes(pid) / 2**20}
+            before = cpu_s_of(pid)
             health_s = args.seconds / 4
             health = asyncio.run(run(ask_for_health(args.pause), port, keys, health_s))
-            base_ms = report(f"/healthz, {args.clients} clients", health, health_s, cpu_s(pid) - before)
+            base_ms = report(f"/healthz, {args.clients} clients", health, health_s, cpu_s_of(pid) - before)
             # Memory is compared from here on: by now everything that is made once is made.
             warm = asyncio.run(run(submit_and_poll(args.pause, 2), port, keys, 5.0))
-            memory["after 5 s"] = memory_mib(pid)
-            before = cpu_s(pid)
+            memory["after 5 s"] = resident_bytes(pid) / 2**20
+            before = cpu_s_of(pid)
 
             def middle() -> None:
-                memory["middle"] = memory_mib(pid)
+                memory["middle"] = resident_bytes(pid) / 2**20
 
             work = asyncio.run(run(submit_and_poll(args.pause, args.polls), port, keys, args.seconds, middle))
             title = f"submit and poll, {args.clients} clients"
-            cost_ms = report(title, work, args.seconds, cpu_s(pid) - before)
-            memory["end"] = memory_mib(pid)
+            cost_ms = report(title, work, args.seconds, cpu_s_of(pid) - before)
+            memory["end"] = resident_bytes(pid) / 2**20
         print(f"\na request costs the server {cost_ms / base_ms:.1f} times what /healthz costs it")
         print("memory of the API, MiB: " + ", ".join(f"{when} {mib:.0f}" for when, mib in memory.items()))
         if work.errors or warm.errors or health.errors:

@@ -27,7 +27,8 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 
-from benchmarks.cpu_time import cpu_s, measure
+from benchmarks.cpu_time import measure
+from benchmarks.processes import cpu_s
 from benchmarks.sequences import DATA, find_sequence
 from vipe_core.annotation import MEASURED
 from vipe_core.evaluation.truth import Estimate, SequenceReport, evaluate, read_truth

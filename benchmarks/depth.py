@@ -22,7 +22,6 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import json
-import re
 import sys
 import tempfile
 from collections.abc import Iterator, Sequence
@@ -38,9 +37,9 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 
-from benchmarks.cpu_time import cpu_s
 from benchmarks.long_video import Looped
 from benchmarks.peers.stereo import stereo_depth
+from benchmarks.processes import anonymous_bytes, cpu_s
 from benchmarks.sequences import DATA, BenchSequence, find_sequence
 from vipe_core.annotation import depth_kind_of
 from vipe_core.depth.geometry import KeyframePrior, length_of
@@ -410,7 +409,7 @@ def _memory(sequence: BenchSequence, settings: DepthSettings) -> int:
             started_s = cpu_s()
             with closing(DenseDepth(settings).stream(source, scene)) as frames:
                 for _ in frames:
-                    peak_bytes = max(peak_bytes, _anonymous_bytes())
+                    peak_bytes = max(peak_bytes, anonymous_bytes())
             table.add_row(str(length), f"{(cpu_s() - started_s) / length:.3f}", f"{peak_bytes / 2**20:.0f}")
     Console(width=100).print(table)
     return 0
@@ -435,11 +434,6 @@ def _looped(scene: SceneMap, length: int, count: int, width: int, height: int) -
         inverse_depth=resized(scene.inverse_depth, cv2.INTER_LINEAR),
         confidence=resized(scene.confidence, cv2.INTER_NEAREST),
     )
-
-
-def _anonymous_bytes() -> int:
-    found = re.search(r"RssAnon:\s+(\d+) kB", Path("/proc/self/status").read_text())
-    return 1024 * int(found[1]) if found else 0
 
 
 if __name__ == "__main__":

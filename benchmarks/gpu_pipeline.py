@@ -15,7 +15,6 @@ same weights, see `peers/vipe_slam.py`. On a GPU its extension must have been bu
 from __future__ import annotations
 
 import argparse
-import math
 import multiprocessing
 import sys
 import tempfile
@@ -35,19 +34,13 @@ import torch
 from rich.console import Console
 from rich.table import Table
 
+from benchmarks.network_slam import FOV_DEG, FPS, NetworkSlam
 from vipe_core.cameras import Camera
 from vipe_core.pipeline.device import device_memory_bytes, resolve_device, set_threads
 from vipe_core.pipeline.memory import USABLE_SHARE, plan_of
 from vipe_core.pipeline.presets import resolve
-from vipe_core.priors.droid import DroidMatcher, DroidNetwork
-from vipe_core.slam.adjustment import Adjuster, FocalPrior
-from vipe_core.slam.frames import EncodedFrames
-from vipe_core.slam.graph import Graph
-from vipe_core.slam.keyframes import KeyframeMap
-from vipe_core.slam.recurrent.backend import RefinedBackend
-from vipe_core.slam.recurrent.posing import FramePoser, Unposed
-from vipe_core.slam.recurrent.tracking import RefinedTracker
-from vipe_core.slam.reprojection import Reprojector
+from vipe_core.priors.droid import DroidNetwork
+from vipe_core.slam.recurrent.posing import Unposed
 from vipe_core.slam.selection import Keyframe
 from vipe_core.slam.settings import SlamSettings
 from vipe_core.slam.timing import StageClock
@@ -56,7 +49,6 @@ from vipe_core.video import open_source
 from vipe_core.video.encode import VideoWriter
 
 _SEED = 1
-_FPS = 30.0
 _PATIENCE_S = 3600.0
 
 
@@ -204,7 +196,7 @@ def _vipe(workload: Workload, folder: Path, device: torch.device) -> Callable[[i
     settings = workload.settings
     info = open_source(workload.video).info
     size = working_size(info.width, info.height, settings.working_area_px)
-    focal_px = Camera.pinhole_from_fov(60.0, size.width, size.height).focal_px
+    focal_px = Camera.pinhole_from_fov(FOV_DEG, size.width, size.height).focal_px
     _, *steps = settings.refinement.global_updates
     state = DroidNetwork.random(_SEED).state_dict()
     slam = vipe_slam.VipeSlam(vipe_slam.load(folder), state, size.size, focal_px, (steps[0], steps[1]), device)
@@ -220,46 +212,31 @@ def _vipe(workload: Workload, folder: Path, device: torch.device) -> Callable[[i
 
 def _annotate(workload: Workload, network: DroidNetwork, frames: int | None = None) -> Run:
     """One video with the pieces that the engine is made of, and a schedule in the place of its decisions."""
-    settings, device = workload.settings, network.device
-    schedule = settings.refinement
-    clock = StageClock(device)
-    source = open_source(workload.video)
-    matcher = DroidMatcher(network)
-    info = source.info
-    size = working_size(info.width, info.height, settings.working_area_px, offset_px=matcher.offset_px)
-    encoded = EncodedFrames(source, size, matcher, settings.frame_cache_bytes)
+    settings = workload.settings
+    clock = StageClock(network.device)
+    slam = NetworkSlam.of(open_source(workload.video), network, settings)
+    built = slam.built
     keyframes: list[Keyframe] = []
-    with clock("decode and encode"), closing(encoded.first_pass()) as stream:
+    with clock("decode and encode"), closing(slam.frames.first_pass()) as stream:
         for work, features in stream:
             if keyframes:
-                matcher.motion_px(keyframes[-1].features, features)  # It decides nothing, and takes its time.
+                slam.matcher.motion_px(keyframes[-1].features, features)  # It decides nothing, and takes its time.
             if work.index % workload.every == 0:
                 keyframes.append(Keyframe(work.index, features))
             if frames is not None and work.index + 1 == frames:
                 break
-    count = len(encoded)
-    camera = Camera.pinhole_from_fov(60.0, size.width, size.height)
-    reprojector = Reprojector("pinhole", size.grid)
-    built = KeyframeMap(size.grid, "pinhole", camera.index_params())
-    scale_px = settings.scaled_px(1.0, size.width)
-    adjuster = Adjuster(settings, device, FocalPrior(math.log(camera.focal_px), 0.1), scale_px)
-    tracker = RefinedTracker(matcher, built, adjuster, reprojector, schedule, scale_px)
-    graph = Graph()
-    backend = RefinedBackend(matcher, built, graph, adjuster, reprojector, schedule, scale_px)
+    count = len(slam.frames)
     with torch.inference_mode():
         with clock("track"):
-            first = min(settings.min_keyframes, len(keyframes))
-            tracker.start(keyframes[:first], [one.index / _FPS for one in keyframes[:first]])
-            for keyframe in keyframes[first:]:
-                tracker.add(keyframe, keyframe.index / _FPS)
+            for _ in slam.track(keyframes):
+                pass
         with clock("backend"):
-            for updates in schedule.global_updates[1:]:
-                backend.run(updates)
+            for updates in settings.refinement.global_updates[1:]:
+                slam.backend.run(updates)
         with clock("infill"):
-            usable = np.ones((len(built), size.grid.num_cells), np.bool_)
-            poser = FramePoser(matcher, built, adjuster, usable, schedule)
+            poser = slam.poser()
             waiting: list[Unposed] = []
-            with closing(encoded.again(0, count)) as stream:
+            with closing(slam.frames.again(0, count)) as stream:
                 for index, features in stream:
                     before = min(index // workload.every, len(built) - 2)
                     if index % workload.every:
@@ -267,7 +244,7 @@ def _annotate(workload: Workload, network: DroidNetwork, frames: int | None = No
                     if len(waiting) == settings.infill_batch or (waiting and index == count - 1):
                         poser.run(waiting)
                         waiting = []
-    return Run(count, len(built), len(graph), clock.seconds, max(clock.peak_bytes.values(), default=0))
+    return Run(count, len(built), len(slam.graph), clock.seconds, max(clock.peak_bytes.values(), default=0))
 
 
 def moving_clip(path: Path, frames: int, width: int, height: int) -> Path:
@@ -276,7 +253,7 @@ def moving_clip(path: Path, frames: int, width: int, height: int) -> Path:
     coarse = torch.from_numpy(rng.uniform(0, 255, (1, 3, height // 8 + 2, width // 8 + frames // 4 + 2)))
     wide = torch.nn.functional.interpolate(coarse, scale_factor=8, mode="bicubic")[0].clamp(0, 255)
     picture = wide.permute(1, 2, 0).numpy().astype(np.uint8)
-    with VideoWriter(path, _FPS) as writer:
+    with VideoWriter(path, FPS) as writer:
         for index in range(frames):
             writer.write(np.ascontiguousarray(picture[:height, 2 * index : 2 * index + width]))
     return path

@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import re
 import sys
 import tempfile
 import time
@@ -28,9 +27,10 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 
-from benchmarks.cpu_time import cpu_s, warm_up
+from benchmarks.processes import anonymous_bytes, cpu_s
 from benchmarks.sequences import DATA, find_sequence
 from vipe_core.pipeline.annotator import Annotator
+from vipe_core.pipeline.warmup import warm_up
 from vipe_core.priors.classical import classical_priors
 from vipe_core.quality import assess
 from vipe_core.slam.system import Slam
@@ -116,7 +116,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _run(annotator: Annotator, source: Looped) -> LongRun:
     spent_s: dict[str, float] = {}
-    start_bytes = peak_bytes = _anonymous_bytes()
+    start_bytes = peak_bytes = anonymous_bytes()
     last_s, last_cpu_s, silence_s = time.perf_counter(), cpu_s(), 0.0
 
     def report(stage: str, done: int, total: int | None) -> None:
@@ -125,7 +125,7 @@ def _run(annotator: Annotator, source: Looped) -> LongRun:
         spent_s[stage] = spent_s.get(stage, 0.0) + now_cpu_s - last_cpu_s
         silence_s = max(silence_s, now_s - last_s)
         last_s, last_cpu_s = now_s, now_cpu_s
-        peak_bytes = max(peak_bytes, _anonymous_bytes())
+        peak_bytes = max(peak_bytes, anonymous_bytes())
 
     settings = annotator.preset.slam
     slam = Slam(classical_priors(), settings, annotator.device)
@@ -140,16 +140,11 @@ def _run(annotator: Annotator, source: Looped) -> LongRun:
         cpu_s_per_frame=(sum(spent_s.values()) - backend_s) / count,
         backend_cpu_s=backend_s,
         start_bytes=start_bytes,
-        peak_bytes=max(peak_bytes, _anonymous_bytes()),
+        peak_bytes=max(peak_bytes, anonymous_bytes()),
         silence_s=silence_s,
         reliable=quality.reliable,
         loop_edges=quality.loop_edges,
     )
-
-
-def _anonymous_bytes() -> int:
-    found = re.search(r"RssAnon:\s+(\d+) kB", Path("/proc/self/status").read_text())
-    return 1024 * int(found[1]) if found else 0
 
 
 def _print(runs: Sequence[LongRun], name: str) -> None:

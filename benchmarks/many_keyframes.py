@@ -12,7 +12,6 @@ from __future__ import annotations
 import argparse
 import math
 import multiprocessing
-import re
 import sys
 import tempfile
 import time
@@ -27,20 +26,13 @@ from rich.console import Console
 from rich.table import Table
 
 from benchmarks.gpu_pipeline import moving_clip
-from vipe_core.cameras import Camera
+from benchmarks.network_slam import NetworkSlam
+from benchmarks.processes import anonymous_bytes
 from vipe_core.pipeline.device import resolve_device, set_threads
 from vipe_core.pipeline.presets import resolve
-from vipe_core.priors.droid import DroidMatcher, DroidNetwork
-from vipe_core.slam.adjustment import Adjuster, FocalPrior
-from vipe_core.slam.frames import EncodedFrames
-from vipe_core.slam.graph import Graph
-from vipe_core.slam.keyframes import KeyframeMap
-from vipe_core.slam.recurrent.backend import RefinedBackend
-from vipe_core.slam.recurrent.posing import FramePoser, Unposed
-from vipe_core.slam.recurrent.tracking import RefinedTracker
-from vipe_core.slam.reprojection import Reprojector
+from vipe_core.priors.droid import DroidNetwork
+from vipe_core.slam.recurrent.posing import Unposed
 from vipe_core.slam.selection import Keyframe
-from vipe_core.slam.working import working_size
 from vipe_core.video import open_source
 
 _WIDTH, _HEIGHT = 64, 48
@@ -127,42 +119,33 @@ def _costs(count: int, device_name: str) -> Costs:
     )
     settings = replace(settings, working_area_px=_WIDTH * _HEIGHT, refinement=schedule)
     network = DroidNetwork.random(1).ready(device)
-    matcher = DroidMatcher(network)
     with tempfile.TemporaryDirectory(prefix="vipe-keyframes-") as folder, torch.inference_mode():
         frames = count + math.ceil(count / (_POSED - 1)) - 1
-        source = open_source(moving_clip(Path(folder) / "clip.mp4", frames, _WIDTH, _HEIGHT))
-        size = working_size(_WIDTH, _HEIGHT, settings.working_area_px, offset_px=matcher.offset_px)
-        encoded = EncodedFrames(source, size, matcher, settings.frame_cache_bytes)
-        with closing(encoded.first_pass()) as stream:
+        video = moving_clip(Path(folder) / "clip.mp4", frames, _WIDTH, _HEIGHT)
+        slam = NetworkSlam.of(open_source(video), network, settings)
+        built = slam.built
+        with closing(slam.frames.first_pass()) as stream:
             seen = [Keyframe(work.index, features) for work, features in stream]
         between = [frame for frame in seen if frame.index % _POSED == _POSED // 2]
         keyframes = [frame for frame in seen if frame.index % _POSED != _POSED // 2]
 
-        camera = Camera.pinhole_from_fov(60.0, size.width, size.height)
-        reprojector = Reprojector("pinhole", size.grid)
-        built, graph = KeyframeMap(size.grid, "pinhole", camera.index_params()), Graph()
-        scale_px = settings.scaled_px(1.0, size.width)
-        adjuster = Adjuster(settings, device, FocalPrior(math.log(camera.focal_px), 0.1), scale_px)
-        tracker = RefinedTracker(matcher, built, adjuster, reprojector, schedule, scale_px)
-        first = min(settings.min_keyframes, len(keyframes))
-        tracker.start(keyframes[:first], [frame.index / _FPS for frame in keyframes[:first]])
+        tracked = slam.track(keyframes)
+        since = max(next(tracked), len(keyframes) - _LAST)
         held_bytes = _held_bytes(device)
         started = clock()
-        for frame in keyframes[first:]:
-            if len(built) == len(keyframes) - _LAST:
+        for length in tracked:
+            if length == since:
                 started = clock()
-            tracker.add(frame, frame.index / _FPS)
         poses_read = [built.pose(k) for k in range(len(built))]  # What is queued is done.
-        track_s = (clock() - started) / _LAST
+        track_s = (clock() - started) / (len(keyframes) - since)
         tracked_bytes = _held_bytes(device) - held_bytes
 
         started = clock()
-        RefinedBackend(matcher, built, graph, adjuster, reprojector, schedule, scale_px).run(1)
+        slam.backend.run(1)
         backend_s = clock() - started
 
         numbers = {frame.index: k for k, frame in enumerate(keyframes)}
-        usable = np.ones((len(built), size.grid.num_cells), np.bool_)
-        poser = FramePoser(matcher, built, adjuster, usable, schedule)
+        poser = slam.poser()
         started = clock()
         for frame in between:
             before = numbers[frame.index - 1]
@@ -171,14 +154,13 @@ def _costs(count: int, device_name: str) -> Costs:
             poses_read.extend(poses)
         infill_s = (clock() - started) / len(between)
     finite = np.isfinite(poses_read).all() and all(np.isfinite(built.depth(k)).all() for k in range(len(built)))
-    return Costs(len(built), len(graph), track_s, backend_s, infill_s, tracked_bytes, bool(finite))
+    return Costs(len(built), len(slam.graph), track_s, backend_s, infill_s, tracked_bytes, bool(finite))
 
 
 def _held_bytes(device: torch.device) -> int:
     if device.type == "cuda":
         return torch.cuda.memory_allocated(device)
-    held = re.search(r"RssAnon:\s+(\d+)", Path("/proc/self/status").read_text())
-    return int(held[1]) << 10 if held else 0
+    return anonymous_bytes()
 
 
 if __name__ == "__main__":

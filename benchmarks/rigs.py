@@ -27,7 +27,7 @@ from rich.console import Console
 from rich.table import Table
 from scipy.spatial.transform import Rotation
 
-from benchmarks.cpu_time import cpu_s
+from benchmarks.processes import cpu_s
 from vipe_core.annotation import Annotation, Quality, Reliability
 from vipe_core.cameras import Camera
 from vipe_core.cameras.calibration import Calibration

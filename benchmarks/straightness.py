@@ -33,7 +33,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.cpu_time import cpu_s
+from benchmarks.processes import cpu_s
 from benchmarks.sequences import DATA
 from vipe_core.cameras import Camera
 from vipe_core.cameras.calibration_files import read_calibration

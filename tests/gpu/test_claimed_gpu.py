@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 
-from benchmarks import gpu_pipeline
+from benchmarks import gpu_pipeline, network_slam
 from benchmarks.claimed_gpu import ClaimedGpu, claimed_gpu
 from benchmarks.gpu_pipeline import Run, Workload
 from vipe_core.priors.droid import DroidNetwork
@@ -105,7 +105,7 @@ def annotated(clip: Path, device: str, maps: list[KeyframeMap]) -> Run:
     settings = replace(settings, working_area_px=64 * 48, min_keyframes=3, refinement=schedule)
     network = DroidNetwork.random(1).ready(torch.device(device))
     with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(gpu_pipeline, "KeyframeMap", lambda *of: maps.append(KeyframeMap(*of)) or maps[-1])
+        patched.setattr(network_slam, "KeyframeMap", lambda *of: maps.append(KeyframeMap(*of)) or maps[-1])
         return gpu_pipeline._annotate(Workload(clip, 2, device, settings), network)
 
 
