@@ -24,6 +24,7 @@ from services.storage.base import ObjectInfo
 Call = tuple[Any, ...]
 History = tuple[Any, ...]
 Objects = frozenset[tuple[str, bytes]]
+LastAttempt = Callable[[dict[str, bytes], "Row"], tuple[dict[str, bytes], bytes]]
 
 ERROR = "no answer"
 
@@ -74,6 +75,9 @@ class View:
         if data is None:
             raise ObjectMissing(key)
         return bytes(data)
+
+    def download(self, key: str, path: Path) -> None:
+        path.write_bytes(self.get_bytes(key))
 
     def head(self, key: str) -> ObjectInfo | None:
         size = self._call("head", key)
@@ -138,13 +142,13 @@ class Model:
 
     processes: tuple[Process, ...]
     faults: int
-    last: Callable[[dict[str, bytes], Row], tuple[dict[str, bytes], bytes]]
+    last: LastAttempt
     max_fence: int = 2
     states: int = field(default=0, init=False)
     outcomes: set[str] = field(default_factory=set, init=False)
 
     def __post_init__(self) -> None:
-        self._next = functools.cache(self._run)
+        self.next_call = functools.cache(self._run)
         self._checked: set[Any] = set()
 
     def check(self) -> None:
@@ -179,14 +183,14 @@ class Model:
     def _successors(self, state: State) -> Iterator[tuple[str, State]]:
         if state.row.fence < self.max_fence:
             yield "the lease runs out", replace(state, row=replace(state.row, fence=state.row.fence + 1))
-        for index, call in enumerate(state.late):
-            objects, row, _ = _apply(state.objects, state.row, call)
+        for index, request in enumerate(state.late):
+            objects, row, _ = apply(state.objects, state.row, request)
             left = state.late[:index] + state.late[index + 1 :]
-            yield f"late {_name(call)}", replace(state, objects=objects, row=row, late=left)
+            yield f"late {_name(request)}", replace(state, objects=objects, row=row, late=left)
         for number, process in enumerate(self.processes):
             if state.row.fence < process.fence:
                 continue
-            call, outcome = self._next(number, state.histories[number])
+            call, outcome = self.next_call(number, state.histories[number])
             if call is None:
                 self.outcomes.add(outcome if isinstance(outcome, str) else type(outcome).__name__)
                 assert isinstance(outcome, (str, StorageError)), f"process {number} ended with {outcome!r}"
@@ -214,7 +218,7 @@ class Model:
         self, state: State, process: Process, call: Call
     ) -> Iterator[tuple[str, Objects, Row, tuple[Call, ...], Any]]:
         """(fault, objects, row, requests on their way, answer) of every way in which a call can go."""
-        objects, row, answer = _apply(state.objects, state.row, call)
+        objects, row, answer = apply(state.objects, state.row, call)
         yield "", objects, row, (), answer
         if not process.faulty or not state.faults or call[0] not in _REMOTE:
             return
@@ -226,7 +230,7 @@ class Model:
             yield "sent twice", objects, row, (), False  # 412 about its own object
         if call[0] == "put" and call[1].startswith("payload/"):
             short = ("put", call[1], call[2][: len(call[2]) // 2])
-            objects, row, answer = _apply(state.objects, state.row, short)
+            objects, row, answer = apply(state.objects, state.row, short)
             yield "truncated", objects, row, (), answer
 
     def _promises(self, state: State) -> None:
@@ -255,7 +259,7 @@ class Model:
 _REMOTE = {"create", "put", "get", "head", "list", "delete"}
 
 
-def _apply(objects: Objects, row: Row, call: Call) -> tuple[Objects, Row, Any]:
+def apply(objects: Objects, row: Row, call: Call) -> tuple[Objects, Row, Any]:
     """One atomic call: (objects, row, answer)."""
     match call:
         case ("create", key, data):
@@ -295,7 +299,7 @@ def _get(objects: Objects, key: str) -> bytes | None:
 
 def _land(objects: Objects, row: Row, late: tuple[Call, ...]) -> tuple[Objects, Row]:
     for call in late:
-        objects, row, _ = _apply(objects, row, call)
+        objects, row, _ = apply(objects, row, call)
     return objects, row
 
 

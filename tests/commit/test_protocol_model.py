@@ -13,22 +13,23 @@ import itertools
 import sys
 import types
 import uuid
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from protocol_model import Model, Process, Row, View, Violation
+from protocol_model import LastAttempt, Model, Process, Row, View, Violation, apply
 from shard_factory import JOB, make_lease, success
 
 import services.commit.gc as gc_module
 import services.commit.protocol as protocol_module
 from services.commit.layout import commit_key
+from services.commit.protocol import CommitOutcome, PreparedPayload
 from services.commit.reconcile import committed_record
-from services.commit.tar_writer import write_tar
-from services.commit.verify import verify_tar
+from services.commit.tar_writer import WrittenTar, write_tar
+from services.commit.verify import Members, verify_tar
 from services.domain.errors import IntegrityError, StorageError
-from services.domain.models import JobSpec, Lease
+from services.domain.models import Attribute, JobSpec, Lease
 
 KEYS = ("a", "b")
 
@@ -58,7 +59,7 @@ class Attempts:
         lease = lease_of(attempt)
 
         def run(view: View) -> str:
-            if attempt > 1 and (found := committed_record(view, JOB, lease.shard_id)) is not None:  # type: ignore[arg-type]
+            if attempt > 1 and (found := committed_record(view, JOB, lease.shard_id)) is not None:
                 view.record_commit(found)
                 return "found"
             prepared = self._prepared(view, attempt, lambda: None)
@@ -76,7 +77,7 @@ class Attempts:
                 key = commit_key(JOB, lease.shard_id)
                 if (decided := view.decided()) is not None and view.head(key) is None:
                     view.put_bytes(key, decided)
-                if (found := committed_record(view, JOB, lease.shard_id)) is not None:  # type: ignore[arg-type]
+                if (found := committed_record(view, JOB, lease.shard_id)) is not None:
                     view.record_commit(found)
                     return "found"
             names = tuple(self._protocol.tar_names(lease)[:4])
@@ -85,7 +86,7 @@ class Attempts:
 
         return run
 
-    def _prepared(self, view: View, attempt: int, name: Callable[[], str | None]):  # type: ignore[no-untyped-def]
+    def _prepared(self, view: View, attempt: int, name: Callable[[], str | None]) -> PreparedPayload:
         lease = lease_of(attempt)
         results = [success(key, attempt=attempt) for key in KEYS]
         nonces = itertools.count()
@@ -93,7 +94,7 @@ class Attempts:
             patch.setattr(uuid, "uuid4", lambda: types.SimpleNamespace(hex=f"{attempt}-{next(nonces)}"))
             for packing in (0, 1):
                 try:
-                    return self._protocol.prepare_payload(
+                    prepared: PreparedPayload = self._protocol.prepare_payload(
                         lease,
                         results,
                         self._artifacts(attempt, packing),
@@ -101,13 +102,14 @@ class Attempts:
                         view,
                         tar_name=name(),
                     )
+                    return prepared
                 except (StorageError, IntegrityError):
                     if packing:
                         raise StorageError("given back") from None
         raise AssertionError
 
     @staticmethod
-    def _committed(view: View, write: Callable[[], object]) -> str:
+    def _committed(view: View, write: Callable[[], CommitOutcome]) -> str:
         for last in (False, True):
             try:
                 outcome = write()
@@ -115,9 +117,9 @@ class Attempts:
                 if last:
                     raise
             else:
-                if outcome.record is not None:  # type: ignore[attr-defined]
-                    view.record_commit(outcome.record)  # type: ignore[attr-defined]
-                return str(outcome.kind)  # type: ignore[attr-defined]
+                if outcome.record is not None:
+                    view.record_commit(outcome.record)
+                return outcome.kind
         raise AssertionError
 
     def _artifacts(self, attempt: int, packing: int) -> Path:
@@ -125,7 +127,7 @@ class Attempts:
 
 
 def reconcile(view: View) -> str:
-    found = committed_record(view, JOB, lease_of(1).shard_id)  # type: ignore[arg-type]
+    found = committed_record(view, JOB, lease_of(1).shard_id)
     if found is not None:
         view.record_commit(found)
     return "reconciled"
@@ -139,24 +141,28 @@ def collector(gc: types.ModuleType) -> Callable[[View], str]:
     return run
 
 
-@pytest.fixture
-def attempts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[types.ModuleType], Attempts]:
-    """Tars are built once for each packing: a model runs the code some ten thousand times."""
-    built: dict[tuple[str, str], bytes] = {}
+Around = Callable[[types.ModuleType], Attempts]
+"""Attempts around a version of the protocol."""
 
-    def write(path: Path, samples):  # type: ignore[no-untyped-def]
+
+@pytest.fixture
+def attempts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Around:
+    """Tars are built once for each packing: a model runs the code some ten thousand times."""
+    built: dict[tuple[str, str], tuple[bytes, WrittenTar]] = {}
+
+    def write(path: Path, samples: Iterable[Sequence[tuple[str, Path]]]) -> WrittenTar:
         files = list(samples)
         key = (str(files[0][0][1].parent.parent), path.name)
         if key not in built:
             tar = write_tar(path, files)
-            built[key] = path.read_bytes(), tar  # type: ignore[assignment]
-        data, tar = built[key]  # type: ignore[misc]
+            built[key] = path.read_bytes(), tar
+        data, tar = built[key]
         path.write_bytes(data)
         return replace(tar, path=path)
 
-    verified: dict[str, object] = {}
+    verified: dict[str, Members] = {}
 
-    def verify(tar, attribute, keys):  # type: ignore[no-untyped-def]
+    def verify(tar: WrittenTar, attribute: Attribute, keys: Sequence[str]) -> Members:
         if tar.sha256 not in verified:
             verified[tar.sha256] = verify_tar(tar, attribute, keys)
         return verified[tar.sha256]
@@ -169,20 +175,18 @@ def attempts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[types
     return around
 
 
-def last_attempt(made: Attempts, code: Callable[[View], str]):  # type: ignore[no-untyped-def]
+def last_attempt(made: Attempts, code: Callable[[View], str]) -> LastAttempt:
     """The attempt that ends it: undisturbed, and then the garbage collection; what is there after them."""
     model = Model((Process(code, 3), Process(collector(gc_module))), 0, lambda objects, row: (objects, b""))
 
     def run(objects: dict[str, bytes], row: Row) -> tuple[dict[str, bytes], bytes]:
-        from protocol_model import _apply
-
         now, row = frozenset(objects.items()), replace(row, fence=3)
         for number in (0, 1):
             history: tuple[object, ...] = ()
-            while (call := model._next(number, history)[0]) is not None:
-                now, row, answer = _apply(now, row, call)
+            while (call := model.next_call(number, history)[0]) is not None:
+                now, row, answer = apply(now, row, call)
                 history = (*history, answer)
-            outcome = model._next(number, history)[1]
+            outcome = model.next_call(number, history)[1]
             assert isinstance(outcome, str), f"the last attempt failed: {outcome!r}"
         assert row.committed is not None, "the database does not know of the commit"
         after = dict(now)
@@ -204,7 +208,7 @@ def explore(made: Attempts, mode: str, *, faults: int, beside: tuple[Callable[[V
 @pytest.mark.slow
 @pytest.mark.parametrize("mode", ["output", "database"])
 @pytest.mark.parametrize(("faults", "states"), [(1, 3_000), pytest.param(2, 10_000, marks=pytest.mark.long)])
-def test_two_attempts_with_faults_anywhere(attempts, mode: str, faults: int, states: int) -> None:  # type: ignore[no-untyped-def]
+def test_two_attempts_with_faults_anywhere(attempts: Around, mode: str, faults: int, states: int) -> None:
     model = explore(attempts(protocol_module), mode, faults=faults)
     assert model.outcomes == {"committed", "adopted", "found", "lost_lease", "StorageError"}
     assert model.states > states
@@ -220,8 +224,8 @@ def test_two_attempts_with_faults_anywhere(attempts, mode: str, faults: int, sta
     ],
     ids=["collector", "reconciler", "both"],
 )
-def test_garbage_collection_and_reconciler_at_any_moment(  # type: ignore[no-untyped-def]
-    attempts, mode: str, beside: tuple[Callable[[View], str], ...], ended: set[str]
+def test_garbage_collection_and_reconciler_at_any_moment(
+    attempts: Around, mode: str, beside: tuple[Callable[[View], str], ...], ended: set[str]
 ) -> None:
     # Four processes have orders enough without faults.
     model = explore(attempts(protocol_module), mode, faults=2 - len(beside), beside=beside)
@@ -281,7 +285,7 @@ MUTANTS = {
 
 
 @pytest.mark.parametrize("name", MUTANTS)
-def test_a_protocol_that_is_broken_is_found_out(attempts, name: str) -> None:  # type: ignore[no-untyped-def]
+def test_a_protocol_that_is_broken_is_found_out(attempts: Around, name: str) -> None:
     where, old, new = MUTANTS[name]
     module = gc_module if where == "gc" else protocol_module
     mutant = _mutated(module, old, new)
