@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal, get_args
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
@@ -15,7 +15,6 @@ if TYPE_CHECKING:
     from vipe_core.formats import Artifacts
 
 Format = Literal["npz", "png16", "video", "ply", "mesh", "colmap", "nerfstudio", "pictures"]
-FORMATS: tuple[Format, ...] = get_args(Format)
 
 
 def export(

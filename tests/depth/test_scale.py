@@ -22,7 +22,6 @@ from vipe_core.depth.scale import (
     normalised,
     ratio_to_prior,
     rescaled,
-    scale_from_baseline,
     scale_from_path,
     scale_from_pixel,
     scale_from_ratios,
@@ -176,18 +175,6 @@ def test_a_pixel_that_nothing_measured(scene: SceneMap) -> None:
     blind = replace(scene, confidence=np.zeros_like(scene.confidence))
     with pytest.raises(ScaleUnobservable, match="nothing was measured"):
         scale_from_pixel(blind, (100, 100), 3, 2.0, (640, 480))
-
-
-def test_a_baseline() -> None:
-    left = np.repeat(np.eye(4)[None], 5, axis=0)
-    right = left.copy()
-    right[:, 0, 3] = [0.1, 0.1, 0.102, 0.098, 0.5]
-    found = scale_from_baseline({"left": left, "right": right}, "left", "right", 0.12)
-    assert found.metres_per_unit == pytest.approx(1.2, rel=0.03)
-    with pytest.raises(ScaleUnobservable, match="'top'"):
-        scale_from_baseline({"left": left, "right": right}, "left", "top", 0.12)
-    with pytest.raises(ScaleUnobservable, match="same place"):
-        scale_from_baseline({"a": left, "b": left}, "a", "b", 0.12)
 
 
 def test_many_noisy_frames_and_some_wrong_ones_give_the_scale_within_its_interval() -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from contextlib import closing
 from pathlib import Path
+from typing import get_args
 
 import cv2
 import numpy as np
@@ -13,7 +14,7 @@ from exact_room import POSES, depth_and_colour, distance_to_surfaces
 from room_artifacts import CAMERAS, write_room
 from typer.testing import CliRunner
 
-from services.cli.export import FORMATS
+from services.cli.export import Format
 from services.cli.main import app
 from vipe_core.cameras.calibration_files import read_calibration
 from vipe_core.errors import ExportUnsupported, FormatError
@@ -56,7 +57,7 @@ def cut_room(tmp_path_factory: pytest.TempPathFactory) -> Artifacts:
 
 
 def test_the_table_knows_every_format() -> None:
-    assert set(EXPORTS) == set(FORMATS)
+    assert set(EXPORTS) == set(get_args(Format))
 
 
 # A rational distortion is an opencv camera to all but the formats that have no place for its last coefficients. A

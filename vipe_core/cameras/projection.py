@@ -33,11 +33,6 @@ _MIN_DISK = 1e-6
 _MIN_SLOPE = 1e-9
 
 
-def num_free_intrinsics(model: CameraModel) -> int:
-    """How many intrinsics have derivatives: log f, and alpha for `mei`."""
-    return {"pinhole": 1, "mei": 2, "equirect": 0}[model]
-
-
 def _require_derivable(model: CameraModel) -> None:
     """Raises:
     ConfigError: A lens with measured distortion, which only `Camera` projects with.
@@ -82,7 +77,7 @@ def on_image_disk(model: CameraModel, params: Tensor, px: Tensor) -> Tensor:
 
 
 def unproject_jacobian(model: CameraModel, params: Tensor, px: Tensor) -> Tensor:
-    """(..., 3, n) derivative of `unproject` with respect to the n = `num_free_intrinsics` intrinsics (log f, alpha)."""
+    """(..., 3, n) derivative of `unproject` with respect to the n free intrinsics: log f, and alpha for `mei`."""
     if model == "equirect":
         return px.new_zeros(*px.shape[:-1], 3, 0)
     m = (px - params[2:4]) / params[:2]

@@ -8,7 +8,7 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -194,34 +194,6 @@ def scale_from_path(scene: SceneMap, path_m: float) -> ScaleEstimate:
     smooth[1:-1] = (centres[:-2] + centres[1:-1] + centres[2:]) / 3
     jitter = 1 - float(np.linalg.norm(np.diff(smooth, axis=0), axis=1).sum()) / length
     return ScaleEstimate(path_m / length, max(jitter, 1e-3), len(centres))
-
-
-def scale_from_baseline(
-    world_from_cam: Mapping[str, NDArray[np.float64]], first: str, second: str, baseline_m: float
-) -> ScaleEstimate:
-    """From the known distance between two cameras of a rig.
-
-    Args:
-        world_from_cam: (N, 4, 4) poses, or (4, 4), of each camera by its name; the same frames for both.
-        first, second: Names of the two.
-        baseline_m: Distance between their centres.
-
-    Raises:
-        ScaleUnobservable: There is no such camera, or the poses do not tell their centres apart.
-        ValueError: The baseline is not positive.
-    """
-    if not baseline_m > 0:
-        raise ValueError(f"the baseline must be a positive number of metres, got {baseline_m!r}")
-    for name in (first, second):
-        if name not in world_from_cam:
-            raise ScaleUnobservable(f"no camera of the rig is called {name!r}; it has {', '.join(world_from_cam)}")
-    a, b = (np.asarray(world_from_cam[name], np.float64).reshape(-1, 4, 4)[:, :3, 3] for name in (first, second))
-    distance = np.linalg.norm(a - b, axis=1)
-    seen = distance[np.isfinite(distance) & (distance > 0)]
-    found = scale_from_ratios([FrameRatio(math.log(baseline_m / value), 0.0, 1.0) for value in seen])
-    if found is None:
-        raise ScaleUnobservable(f"the cameras {first!r} and {second!r} are at the same place, which tells no scale")
-    return found
 
 
 def scale_from_pixel(

@@ -178,12 +178,7 @@ class _ShotInfill:
         into.cam_from_world[frames] = interpolate_trajectory(keyframes.times_s, keyframes.poses(), times_s[frames])
         self._known = set(keyframes.frame_index)
         for k, index in enumerate(keyframes.frame_index):
-            into.cam_from_world[index] = keyframes.pose(k)
-            into.residual_px[index] = shot_map.found.keyframe_residual_px[k]
-            into.inlier_ratio[index] = shot_map.found.keyframe_inlier_ratio[k]
-            into.coverage[index] = shot_map.found.keyframe_coverage[k]
-            into.interpolated[index] = False
-            into.labels[index] = shot_map.labels[k]
+            take_keyframe(into, index, shot_map, k)
 
     def add(self, index: int, features: Any) -> None:
         """Measure a frame; every so many are posed together."""
@@ -357,6 +352,16 @@ def blank_trajectory(count: int, num_cells: int) -> Trajectory:
         np.ones(count, dtype=np.bool_),
         np.full((count, num_cells), UNKNOWN, dtype=np.int8),
     )
+
+
+def take_keyframe(into: Trajectory, index: int, shot_map: ShotMap, k: int) -> None:
+    """Frame `index` is the map's keyframe k: what the map knows of it."""
+    into.cam_from_world[index] = shot_map.keyframes.pose(k)
+    into.residual_px[index] = shot_map.found.keyframe_residual_px[k]
+    into.inlier_ratio[index] = shot_map.found.keyframe_inlier_ratio[k]
+    into.coverage[index] = shot_map.found.keyframe_coverage[k]
+    into.interpolated[index] = False
+    into.labels[index] = shot_map.labels[k]
 
 
 def judge(seen: Iterable[tuple[Induced, Match, Array]], robust_scale_px: float) -> Fit:

@@ -18,7 +18,7 @@ from vipe_core.priors.protocols import Aligner, DenseMatcher, Match, SparseTrack
 from vipe_core.slam.adjustment import SETTLE, Step
 from vipe_core.slam.consensus import MAJORITY
 from vipe_core.slam.graph import sharpen
-from vipe_core.slam.infill import MIN_INLIERS, SCHEDULE, Trajectory, blank_trajectory, judge
+from vipe_core.slam.infill import MIN_INLIERS, SCHEDULE, Trajectory, blank_trajectory, judge, take_keyframe
 from vipe_core.slam.mapping import ShotMap
 from vipe_core.slam.reprojection import Induced, Reprojector
 from vipe_core.slam.rig_consensus import Sighting, consensus_rig_pose
@@ -125,13 +125,7 @@ class _RigInfill:
         for view, into in enumerate(self.trajectories):
             into.cam_from_world[:] = self._mounts[view] @ between
             for instant, index in enumerate(self._instants):
-                k = instant * views + view
-                into.cam_from_world[index] = keyframes.pose(k)
-                into.residual_px[index] = shot_map.found.keyframe_residual_px[k]
-                into.inlier_ratio[index] = shot_map.found.keyframe_inlier_ratio[k]
-                into.coverage[index] = shot_map.found.keyframe_coverage[k]
-                into.interpolated[index] = False
-                into.labels[index] = shot_map.labels[k]
+                take_keyframe(into, index, shot_map, instant * views + view)
         self._known = set(self._instants)
 
     def add(self, index: int, features: tuple[Any, ...]) -> None:
