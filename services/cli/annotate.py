@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from services.cli.engine_options import CameraModel, DetectionInterval, Device, Preset, listed
+
 if TYPE_CHECKING:
     from vipe_core.annotation import Annotation
     from vipe_core.pipeline.annotator import Annotator
@@ -28,18 +30,9 @@ def annotate(
             metavar="INPUT...", help="Video files, or directories of images. With --rig, one per view, in their order."
         ),
     ] = None,
-    preset: Annotated[
-        str,
-        typer.Option(
-            help="classical; classical_fast: coarser dense depth; wide_angle: a bent lens; panorama: 360 degrees; "
-            "vipe_fast, pose_only: by the DROID network; vipe: all of the paper's networks (vipectl models)."
-        ),
-    ] = "classical",
-    camera: Annotated[
-        str | None,
-        typer.Option(help="pinhole, mei (wide angle), equirect (360 degrees), or auto. Default: the preset's own."),
-    ] = None,
-    device: Annotated[str, typer.Option(help="cpu or cuda.")] = "cpu",
+    preset: Preset = "classical",
+    camera: CameraModel = None,
+    device: Device = "cpu",
     masks: Annotated[
         Path | None,
         typer.Option(metavar="DIR", help="One PNG per frame of the one INPUT; what is not zero in it is not used."),
@@ -67,9 +60,7 @@ def annotate(
             help="Find, follow and mask what these words name (extra hf); '' for nothing. Default: the preset's own.",
         ),
     ] = None,
-    detection_interval: Annotated[
-        float | None, typer.Option(metavar="SECONDS", help="Time between looks for new things. Default: 2.")
-    ] = None,
+    detection_interval: DetectionInterval = None,
     metric_depth: Annotated[
         str | None,
         typer.Option(metavar="NETWORK", help="What tells the scale, such as hf.depth_pro or nvidia_vipe.unidepth."),
@@ -124,7 +115,7 @@ def annotate(
         raise typer.BadParameter(str(error), param_hint="--calibration") from error
     use_limits(read_settings().media_limits())
     console = Console(stderr=True, quiet=as_json)
-    words = None if phrases is None else tuple(word.strip() for word in phrases.split(",") if word.strip())
+    words = None if phrases is None else tuple(listed(phrases))
     options = PresetOptions(words, detection_interval, metric_depth)
     if rig is not None:
         if options != PresetOptions():

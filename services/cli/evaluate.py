@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from services.cli.engine_options import DEVICE_HELP, PRESET_HELP
+
 if TYPE_CHECKING:
     from vipe_core.evaluation.report import Heading
     from vipe_core.evaluation.results import SequenceResult
@@ -43,10 +45,8 @@ def evaluate(
     max_frames: Annotated[
         int | None, typer.Option(min=2, help="Only the first so many frames.", rich_help_panel=_RAW)
     ] = None,
-    preset: Annotated[
-        str, typer.Option(help="classical, or classical_fast: coarser dense depth.", rich_help_panel=_HOW)
-    ] = "classical",
-    device: Annotated[str, typer.Option(help="cpu or cuda.", rich_help_panel=_HOW)] = "cpu",
+    preset: Annotated[str, typer.Option(help=PRESET_HELP, rich_help_panel=_HOW)] = "classical",
+    device: Annotated[str, typer.Option(help=DEVICE_HELP, rich_help_panel=_HOW)] = "cpu",
     jobs: Annotated[int, typer.Option(min=1, help="Sequences at a time.", rich_help_panel=_HOW)] = 1,
     ablate: Annotated[
         bool, typer.Option("--ablate", help="The paper's table 4: every row of it.", rich_help_panel=_HOW)

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from services.cli.addresses import absolute
+from services.cli.engine_options import CameraModel, DetectionInterval, Preset, listed
 
 if TYPE_CHECKING:
     from services.client import Client
@@ -59,17 +60,8 @@ def submit(
     output: Annotated[
         str, typer.Option("-o", "--output", metavar="OUT", help="Directory or s3://bucket/prefix of this job.")
     ],
-    preset: Annotated[
-        str,
-        typer.Option(
-            help="classical; classical_fast: coarser dense depth; wide_angle: a bent lens; panorama: 360 degrees; "
-            "vipe_fast, pose_only: by the DROID network (vipectl models)."
-        ),
-    ] = "classical",
-    camera: Annotated[
-        str | None,
-        typer.Option(help="pinhole, mei (wide angle), equirect (360 degrees), or auto. Default: the preset's own."),
-    ] = None,
+    preset: Preset = "classical",
+    camera: CameraModel = None,
     name: str = "",
     scale_from: Annotated[
         str | None,
@@ -78,9 +70,7 @@ def submit(
     phrases: Annotated[
         str | None, typer.Option(metavar="A,B,...", help="What to find and mask, as `vipectl annotate --phrases`.")
     ] = None,
-    detection_interval: Annotated[
-        float | None, typer.Option(metavar="SECONDS", help="Time between looks for new things. Default: 2.")
-    ] = None,
+    detection_interval: DetectionInterval = None,
     metric_depth: Annotated[
         str | None, typer.Option(metavar="NETWORK", help="What tells the scale, as `vipectl annotate --metric-depth`.")
     ] = None,
@@ -122,7 +112,7 @@ def submit(
     if scale_from is not None:
         spec["scale_from"] = scale_from
     if phrases is not None:
-        spec["phrases"] = [word.strip() for word in phrases.split(",") if word.strip()]
+        spec["phrases"] = listed(phrases)
     if detection_interval is not None:
         spec["detection_interval_s"] = detection_interval
     if metric_depth is not None:
@@ -130,7 +120,7 @@ def submit(
     if calibration is not None:
         spec["calibration"] = _calibration(calibration)
     if attributes is not None:
-        spec["attributes"] = [name.strip() for name in attributes.split(",") if name.strip()]
+        spec["attributes"] = listed(attributes)
     job = client.submit(spec, idempotency_key=key)
     if as_json:
         _print_json(job)

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from services.cli.engine_options import DEVICE_HELP
 from services.cli.settings import Database, settings_from
 
 if TYPE_CHECKING:
@@ -30,7 +31,7 @@ Host = Annotated[str | None, typer.Option(help="Address to listen on.")]
 Port = Annotated[int | None, typer.Option(help="Port of the API; 0 takes a free one.")]
 DataDir = Annotated[Path | None, typer.Option(help="Folder of the database and scratch files.")]
 Slots = Annotated[int | None, typer.Option(help="Worker processes; one video in each.")]
-Device = Annotated[str | None, typer.Option(help="cpu or cuda.")]
+Device = Annotated[str | None, typer.Option(help=DEVICE_HELP)]
 TlsCert = Annotated[Path | None, typer.Option(help="Certificate chain (PEM): speak HTTPS only.")]
 TlsKey = Annotated[Path | None, typer.Option(help="Private key of the certificate (PEM).")]
 

@@ -5,17 +5,18 @@ from __future__ import annotations
 import tempfile
 import time
 from pathlib import Path
-from typing import Annotated
 
 import typer
+
+from services.cli.engine_options import Device, Preset
 
 _TOO_FEW = 64
 """Points of a cloud or blocks of a mesh: what coarsens a scene that outgrows its memory is compiled as well."""
 
 
 def warmup(
-    preset: Annotated[str, typer.Option(metavar="<str>", help="As of `vipectl annotate`.")] = "classical",
-    device: Annotated[str, typer.Option(help="cpu or cuda.")] = "cpu",
+    preset: Preset = "classical",
+    device: Device = "cpu",
 ) -> None:
     """Compile what the engine compiles at its first use on a machine.
 
