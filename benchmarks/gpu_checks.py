@@ -13,8 +13,10 @@
     pipeline    `python -m benchmarks.gpu_pipeline`, with short clips
 
 Every section runs in a process of its own under a time limit and survives the failure of another; those that measure no
-time run side by side. What they print is kept in `--output FILE`, its end on the terminal, a summary last. Without a
-GPU it says so and does nothing. `--vipe FOLDER` and `--droid FOLDER` are handed to the benchmarks.
+time run side by side. What each prints is in a file of its own in `--output FOLDER` from its first line on, how each
+ended in `summary.txt` there as soon as it has; the end of all of it is on the terminal, a summary last. Without a GPU
+it says so and does nothing. `--vipe FOLDER` and `--droid FOLDER` are handed to the benchmarks.
+`python -m benchmarks.gpu_rehearsal` runs the same sections where there is no GPU.
 """
 
 from __future__ import annotations
@@ -26,13 +28,14 @@ import shutil
 import signal
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from itertools import repeat
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO
 
 import torch
 
@@ -337,8 +340,12 @@ class Outcome:
     def passed(self) -> bool:
         return self.outcome == "passed"
 
+    @property
+    def line(self) -> str:
+        return f"{self.name:<12}{self.outcome:<14}{self.seconds:>5.0f} s"
 
-def _sections(vipe: Path | None, droid: Path | None) -> list[list[Section]]:
+
+def sections(vipe: Path | None, droid: Path | None) -> list[list[Section]]:
     """Groups of sections, one after the other; those of a group run side by side."""
     this = [sys.executable, "-m", "benchmarks.gpu_checks", "--check"]
     # The settings of this project name plugins that a bare machine need not have.
@@ -372,47 +379,66 @@ def _sections(vipe: Path | None, droid: Path | None) -> list[list[Section]]:
     ]
 
 
-def _run(section: Section, end: float, output: Path | None) -> Outcome:
+def run(groups: Sequence[Sequence[Section]], seconds: float, folder: Path, *, beside: bool = True) -> list[Outcome]:
+    """Run all sections, within so many seconds in all; what they say is left in a folder.
+
+    Args:
+        beside: Whether those of a group run side by side.
+    """
+    end = time.monotonic() + seconds
+    folder.mkdir(parents=True, exist_ok=True)
+    outcomes: list[Outcome] = []
+    for group in groups:
+        with ThreadPoolExecutor(len(group) if beside else 1) as pool:
+            outcomes += pool.map(lambda section: _run(section, end, folder), group)
+    return outcomes
+
+
+def _run(section: Section, end: float, folder: Path) -> Outcome:
     """Run a section, before the monotonic clock says `end`."""
     start = time.monotonic()
     limit = min(section.limit_s, end - start)
-    if limit <= 0:
-        return Outcome(section.name, "no time left", 0.0, "", section.shown)
+    # A file, and no pipe: what a killed section leaves behind may hold a pipe open, and nothing of it is lost with us.
+    path = folder / f"{section.name.replace(' ', '_')}.txt"
+    outcome = "no time left"
+    if limit > 0:
+        try:
+            with path.open("w") as log:
+                outcome = _outcome(section.command, limit, log)
+        except OSError as error:
+            path.write_text(f"{error}\n")
+            outcome = "not started"
+    said = path.read_text(errors="replace") if path.exists() else ""
+    found = Outcome(section.name, outcome, time.monotonic() - start, said.strip(), section.shown)
+    print(found.line, flush=True)
+    with (folder / "summary.txt").open("a") as log:
+        log.write(f"{found.line}\n")
+    return found
+
+
+def _outcome(command: Sequence[str], limit_s: float, log: TextIO) -> str:
     # A caching allocator would hide what is read beyond the end of a tensor.
-    watched = {"PYTORCH_NO_CUDA_MEMORY_CACHING": "1"} if "--tool" in section.command else {}
+    watched = {"PYTORCH_NO_CUDA_MEMORY_CACHING": "1"} if "--tool" in command else {}
     # Processes side by side must not spin for each other's cores.
     environment = os.environ | {"OMP_NUM_THREADS": "2", "OMP_WAIT_POLICY": "passive"} | watched
     process = subprocess.Popen(
-        section.command,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        text=True,
-        errors="replace",
-        env=environment,
-        start_new_session=True,
+        command, stdin=subprocess.DEVNULL, stdout=log, stderr=log, env=environment, start_new_session=True
     )
     try:
-        said, _ = process.communicate(timeout=limit)
-        outcome = "passed" if process.returncode == 0 else f"failed ({process.returncode})"
+        status = process.wait(limit_s)
     except subprocess.TimeoutExpired:
-        # With its children, which hold its output open.
+        # With its children, which would go on computing beside the next section.
         os.killpg(process.pid, signal.SIGKILL)
-        said, _ = process.communicate()
-        outcome = "out of time"
-    if output is not None:
-        # In one piece, whatever runs beside it.
-        with output.open("a") as log:
-            log.write(f"=== {section.name}: {outcome}\n{said}\n")
-    found = Outcome(section.name, outcome, time.monotonic() - start, said.strip(), section.shown)
-    print(f"{found.name}: {found.outcome} after {found.seconds:.0f} s", flush=True)
-    return found
+        process.wait()
+        return "out of time"
+    return "passed" if status == 0 else f"failed ({status})"
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     parser.add_argument("--vipe", type=Path, metavar="FOLDER")
     parser.add_argument("--droid", type=Path, metavar="FOLDER")
-    parser.add_argument("--output", type=Path, metavar="FILE", help="everything that is said is added to it")
+    parser.add_argument("--output", type=Path, metavar="FOLDER", help="what every section says is left there")
     parser.add_argument("--seconds", type=float, default=560.0, help="in all")
     parser.add_argument("--check", choices=CHECKS, help="this check only, in this process")
     arguments = parser.parse_args(argv)
@@ -422,11 +448,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     if arguments.check:
         print(CHECKS[arguments.check]())
         return 0
-    end = time.monotonic() + arguments.seconds
-    outcomes: list[Outcome] = []
-    for group in _sections(arguments.vipe, arguments.droid):
-        with ThreadPoolExecutor(len(group)) as pool:
-            outcomes += pool.map(lambda section: _run(section, end, arguments.output), group)
+    groups = sections(arguments.vipe, arguments.droid)
+    with tempfile.TemporaryDirectory(prefix="vipe-checks-") as folder:
+        outcomes = run(groups, arguments.seconds, arguments.output or Path(folder))
     print(summary(torch.cuda.get_device_name(), outcomes))
     return int(not all(outcome.passed for outcome in outcomes))
 
@@ -439,7 +463,7 @@ def summary(device: str, outcomes: Sequence[Outcome]) -> str:
         shown = found.shown if found.passed else max(found.shown, 500)
         if found.said:
             parts.append(f"--- {found.name}\n{found.said[-shown:]}")
-    lines = [f"{found.name:<12}{found.outcome:<14}{found.seconds:>5.0f} s" for found in outcomes]
+    lines = [found.line for found in outcomes]
     said = "\n".join(parts)[-10000:]
     return "\n".join([said, f"=== {device}", *lines])
 

@@ -26,7 +26,7 @@ from functools import partial
 from itertools import islice
 from multiprocessing.synchronize import Barrier
 from pathlib import Path
-from queue import Queue
+from queue import Empty, Queue
 from threading import BrokenBarrierError
 
 import numpy as np
@@ -82,6 +82,10 @@ class Run:
     peak_bytes: int
 
 
+class WorkerFailed(Exception):
+    """A process that annotates a video ended without an answer."""
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     parser.add_argument("--device", help="cuda, cuda:N or cpu")
@@ -91,6 +95,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--every", type=int, help="every n-th frame is a keyframe")
     parser.add_argument("--vipe", type=Path, help="unpacked source of nvidia-vipe, to run beside ours")
     parser.add_argument("--lean", action="store_true", help="no volumes of correlation: the profile for small GPUs")
+    parser.add_argument("--short", action="store_true", help="few updates, as without a GPU: not for speed")
     arguments = parser.parse_args(argv)
     device = resolve_device(arguments.device or ("cuda" if torch.cuda.is_available() else "cpu"))
     on_gpu = device.type == "cuda"
@@ -98,7 +103,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     frames = arguments.frames or (300 if on_gpu else 20)
     every = arguments.every or (6 if on_gpu else 2)
     counts = arguments.videos or ([1, 2, 4, 8] if on_gpu else [1, 2])
-    settings = _settings(lean=arguments.lean, short=not on_gpu)
+    settings = _settings(lean=arguments.lean, short=arguments.short or not on_gpu)
 
     console = Console(width=120)
     if not on_gpu:
@@ -115,23 +120,32 @@ def main(argv: Sequence[str] | None = None) -> int:
         both = [("ours", workload)]
         if arguments.vipe is not None:
             both.append(("nvidia-vipe", replace(workload, vipe=arguments.vipe)))
+        failed = False
         for count, (whose, work) in ((count, one) for count in counts for one in both):
-            wall_s, runs = _at_once(work, count)
-            stages = ", ".join(
-                f"{stage} {np.mean([run.seconds[stage] for run in runs]):.2f}" for stage in runs[0].seconds
-            )
-            table.add_row(
-                whose,
-                str(count),
-                f"{sum(run.frames for run in runs) / wall_s:.2f}",
-                f"{wall_s:.2f}",
-                f"{max(run.peak_bytes for run in runs) / 1e9:.2f}" if on_gpu else "-",
-                str(runs[0].keyframes),
-                str(runs[0].edges),
-                stages,
-            )
+            try:
+                wall_s, runs = _at_once(work, count)
+            except WorkerFailed as error:
+                failed = True
+                row = ["failed", "", "", "", "", str(error)]
+            else:
+                row = _row(wall_s, runs, on_gpu=on_gpu)
+            table.add_row(whose, str(count), *row)
+            # Whatever ends this command later.
+            print(whose, count, *row, sep=" | ", file=sys.stderr, flush=True)
         console.print(table)
-    return 0
+    return int(failed)
+
+
+def _row(wall_s: float, runs: Sequence[Run], *, on_gpu: bool) -> list[str]:
+    stages = (f"{stage} {np.mean([run.seconds[stage] for run in runs]):.2f}" for stage in runs[0].seconds)
+    return [
+        f"{sum(run.frames for run in runs) / wall_s:.2f}",
+        f"{wall_s:.2f}",
+        f"{max(run.peak_bytes for run in runs) / 1e9:.2f}" if on_gpu else "-",
+        str(runs[0].keyframes),
+        str(runs[0].edges),
+        ", ".join(stages),
+    ]
 
 
 def _settings(*, lean: bool, short: bool) -> SlamSettings:
@@ -145,7 +159,11 @@ def _settings(*, lean: bool, short: bool) -> SlamSettings:
 
 
 def _at_once(workload: Workload, count: int) -> tuple[float, list[Run]]:
-    """Seconds from when all videos are ready to when the last is done, and each one's part."""
+    """Seconds from when all videos are ready to when the last is done, and each one's part.
+
+    Raises:
+        WorkerFailed: A process ended without an answer, as where memory runs out.
+    """
     context = multiprocessing.get_context("spawn")
     ready, answers = context.Barrier(count + 1), context.Queue()
     workers = [context.Process(target=_worker, args=(workload, ready, answers)) for _ in range(count)]
@@ -154,10 +172,16 @@ def _at_once(workload: Workload, count: int) -> tuple[float, list[Run]]:
     try:
         ready.wait(_PATIENCE_S)
         start_s = time.perf_counter()
-        runs = [answers.get(timeout=_PATIENCE_S) for _ in workers]
+        runs: list[Run] = []
+        while len(runs) < count:
+            try:
+                runs.append(answers.get(timeout=1.0))
+            except Empty:
+                if any(worker.exitcode for worker in workers):
+                    raise WorkerFailed("a worker failed; it says why above") from None
         wall_s = time.perf_counter() - start_s
     except BrokenBarrierError as error:
-        raise SystemExit("a worker failed before it was ready; it says why above") from error
+        raise WorkerFailed("a worker failed before it was ready; it says why above") from error
     finally:
         for worker in workers:
             worker.join(1.0)

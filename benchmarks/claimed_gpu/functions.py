@@ -14,6 +14,9 @@ from benchmarks.claimed_gpu.tensor import ClaimedTensor
 if TYPE_CHECKING:
     from benchmarks.claimed_gpu.machine import ClaimedGpu
 
+# What Python's own types of numbers stand for.
+_NUMBERS = {float: torch.float64, int: torch.int64, bool: torch.bool}
+
 Special = Callable[["ClaimedGpu", Any, Sequence[Any], dict[str, Any]], Any]
 
 
@@ -36,6 +39,8 @@ def _to(gpu: ClaimedGpu, func: Any, args: Sequence[Any], kwargs: dict[str, Any])
             other = given
         elif isinstance(given, torch.dtype):
             dtype = given
+        elif given in _NUMBERS:
+            dtype = _NUMBERS[given]
         elif isinstance(given, bool):
             flags.append(given)
         elif given is not None:
@@ -158,7 +163,7 @@ def _basic(gpu: ClaimedGpu, tensor: Tensor, index: Any) -> tuple[Tensor, list[Te
     parts = list(index) if isinstance(index, tuple) else [index]
     # A list or an array becomes a tensor of the host.
     for k, one in enumerate(parts):
-        if isinstance(one, (list, np.ndarray)):
+        if isinstance(one, (list, tuple, np.ndarray)):
             parts[k] = torch.as_tensor(one, dtype=None if len(one) else torch.int64)
     taken = sum(_dimensions(one) for one in parts)
     gap = next((k for k, one in enumerate(parts) if one is Ellipsis), len(parts))

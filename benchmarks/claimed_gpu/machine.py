@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import ctypes
 import linecache
 import sys
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -21,7 +22,7 @@ from benchmarks.claimed_gpu.runtime import stand_ins
 from benchmarks.claimed_gpu.tensor import ClaimedTensor, dispatched_by
 from vipe_core.ba import cuda, operator
 from vipe_core.ba.cuda.compiler import Specialisation
-from vipe_core.ba.cuda.launcher import Launcher
+from vipe_core.ba.cuda.launcher import Launch, Launcher
 from vipe_core.priors.droid import kernels
 from vipe_core.priors.droid.kernels import LookupKernels
 
@@ -51,6 +52,7 @@ _READING = {
 _TAKE_NUMBERS = ("where", "masked_fill", "masked_fill_", "fill", "fill_")
 # Computed in single precision and rounded, as tensor cores do; a CPU has slow loops for halves, or none.
 _ACCUMULATED = ("convolution", "mm", "bmm", "addmm", "baddbmm")
+_COMPOSITE = torch._C.DispatchKey.CompositeImplicitAutograd
 _HALVES = (torch.float16, torch.bfloat16)
 
 
@@ -143,7 +145,9 @@ class ClaimedGpu(TorchFunctionMode):
         """An operator with tensors of the device among its arguments."""
         name = func.overloadpacket.__name__
         if _composite(func):
-            return func.decompose(*args, **kwargs)
+            # Those that are written in Python call functions of torch again.
+            with self if _COMPOSITE in func.py_kernels else nullcontext():
+                return func.decompose(*args, **kwargs)
         of_host = [one for one in _tensors((args, kwargs)) if not isinstance(one, ClaimedTensor)]
         if name == "_to_copy":
             target = kwargs.get("device")
@@ -221,7 +225,13 @@ class ClaimedGpu(TorchFunctionMode):
             if not isinstance(value, Tensor):
                 return value
             # What an operation in place answers is what it was given.
-            return owners[id(value)] if id(value) in owners else _given(value, args)
+            if id(value) in owners:
+                return owners[id(value)]
+            if not func.is_view or not torch.is_inference_mode_enabled():
+                return _given(value, args)
+            # A view of a tensor from outside of inference is one from there, too.
+            with torch.inference_mode(all(one.is_inference() for one in owners.values())):
+                return _given(value, args)
 
         return _mapped(claimed, found)
 
@@ -295,6 +305,34 @@ def _place(kind: str) -> Place:
     return Place(kind, f"{found.f_globals.get('__name__', '')}.{code.co_qualname}", line)
 
 
+class _Recorded:
+    """A launcher whose launches belong to the graph that is being captured."""
+
+    def __init__(self, gpu: ClaimedGpu, launcher: Launcher) -> None:
+        self._gpu, self._launcher = gpu, launcher
+
+    def on_current_stream(self) -> Launch:
+        launch = self._launcher.on_current_stream()
+
+        def recorded(kernel: str, blocks: int, threads: int, shared_bytes: int, parameters: int) -> None:
+            launch(kernel, blocks, threads, shared_bytes, parameters)
+            if self._gpu.recording is None:
+                return
+            # As a graph has them: the numbers as they are now, whatever is written in their place afterwards.
+            context, *numbers = (ctypes.c_void_p * 3).from_address(parameters)
+            kept = [ctypes.c_int.from_address(number or 0).value for number in numbers]
+
+            def again() -> None:
+                values = (ctypes.c_int * 2)(*kept)
+                at = ctypes.addressof(values)
+                addresses = (ctypes.c_void_p * 3)(context, at, at + ctypes.sizeof(ctypes.c_int))
+                launch(kernel, blocks, threads, shared_bytes, ctypes.addressof(addresses))
+
+            self._gpu.recording.append(again)
+
+        return recorded
+
+
 @contextmanager
 def claimed_gpu(
     launcher: Callable[[Specialisation], Launcher] | None = None,
@@ -308,7 +346,9 @@ def claimed_gpu(
     """
     gpu = ClaimedGpu({torch.ops.vipe_core.bundle_adjustment.default: operator._on_gpu})
     with (
-        patch.object(cuda, "device_launcher", lambda _, kind: None if launcher is None else launcher(kind)),
+        patch.object(
+            cuda, "device_launcher", lambda _, kind: None if launcher is None else _Recorded(gpu, launcher(kind))
+        ),
         patch.object(kernels, "_opened", lambda _, dtype: None if lookups is None else lookups(dtype)),
         stand_ins(gpu),
         dispatched_by(gpu.dispatch),

@@ -120,6 +120,7 @@ def stand_ins(gpu: ClaimedGpu) -> Iterator[None]:
         "default_stream": only,
         "graph_pool_handle": (0, 1),
         "is_current_stream_capturing": False,
+        "get_rng_state": torch.get_rng_state(),
     }
     quiet = (
         "init",
@@ -129,6 +130,7 @@ def stand_ins(gpu: ClaimedGpu) -> Iterator[None]:
         "set_per_process_memory_fraction",
         "set_device",
         "manual_seed_all",
+        "set_rng_state",
     )
     replaced: dict[str, Any] = {
         "Stream": Stream,

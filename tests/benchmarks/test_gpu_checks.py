@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-import time
 from pathlib import Path
 
 import pytest
@@ -22,16 +21,17 @@ def test_without_a_gpu_nothing_is_claimed(arguments: list[str], capsys: pytest.C
 
 
 def test_the_sections_are_checks_that_there_are_and_fit_ten_minutes() -> None:
-    groups = gpu_checks._sections(Path("vipe"), None)
+    groups = gpu_checks.sections(Path("vipe"), None)
     assert sum(max(section.limit_s for section in group) for group in groups) <= 600
     commands = [section.command for group in groups for section in group]
     named = {command[command.index("--check") + 1] for command in commands if "--check" in command}
     assert named | {"small-solves"} == set(gpu_checks.CHECKS)
 
 
-def _run(code: str, tmp_path: Path, limit_s: float = 30.0, left_s: float = 30.0) -> Outcome:
+def _run(code: str, folder: Path, limit_s: float = 30.0, left_s: float = 30.0) -> Outcome:
     section = Section("a section", [sys.executable, "-u", "-c", code], limit_s)
-    return gpu_checks._run(section, time.monotonic() + left_s, tmp_path / "log")
+    (found,) = gpu_checks.run([[section]], left_s, folder)
+    return found
 
 
 def test_a_section_survives_what_it_runs(tmp_path: Path) -> None:
@@ -40,13 +40,21 @@ def test_a_section_survives_what_it_runs(tmp_path: Path) -> None:
     failed = _run("print('so far'); raise SystemError('why')", tmp_path)
     assert failed.outcome == "failed (1)"
     assert failed.said.endswith("SystemError: why")
-    log = (tmp_path / "log").read_text()
-    assert log.startswith("=== a section: passed\nfine\n\n=== a section: failed (1)\nso far\n")
-    # A child that holds the output open is ended as well.
+    # What it leaves behind neither holds it up nor goes on beside the next section; what it said so far is kept.
     late = _run("import os, time; print('begun'); os.fork(); time.sleep(60)", tmp_path, limit_s=1.0)
     assert (late.outcome, late.said) == ("out of time", "begun")
     assert late.seconds < 30
+    assert (tmp_path / "a_section.txt").read_text() == "begun\n"
     assert _run("print('fine')", tmp_path, left_s=-1.0).outcome == "no time left"
+    lines = (tmp_path / "summary.txt").read_text().splitlines()
+    assert [line.split()[2] for line in lines] == ["passed", "failed", "out", "no"]
+
+
+def test_a_section_that_cannot_be_started_costs_no_other(tmp_path: Path) -> None:
+    sections = [Section("gone", [str(tmp_path / "no such tool")], 9.0), Section("there", ["true"], 9.0)]
+    outcomes = gpu_checks.run([sections[:1], sections[1:]], 30.0, tmp_path)
+    assert [outcome.outcome for outcome in outcomes] == ["not started", "passed"]
+    assert "no such tool" in outcomes[0].said
 
 
 def test_the_summary_is_short_and_comes_last() -> None:

@@ -38,6 +38,9 @@ def test_tensors_of_two_devices_do_not_meet() -> None:
         # Numbers, indices and copies may come from the host.
         assert torch.equal((there + torch.tensor(2.0)).cpu(), torch.arange(12.0).view(3, 4) + 2)
         assert torch.equal(there[torch.tensor([2, 0])].cpu()[:, 0], torch.tensor([8.0, 0.0]))
+        assert there[..., (0, 2)].shape == (3, 2)
+        with torch.inference_mode():
+            assert there.squeeze(0).is_inference() == there.is_inference()
         there[1] = here[0]
         assert there[1].tolist() == [1, 1, 1, 1]
     with pytest.raises(RuntimeError, match="after its end"):

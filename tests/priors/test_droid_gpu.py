@@ -52,7 +52,9 @@ def test_a_gpu_says_what_a_cpu_says_to_half_precision(gpu: DroidMatcher) -> None
 def test_graphs_change_nothing_and_runs_are_bitwise_equal(gpu: DroidMatcher) -> None:
     with_graphs = [refined(gpu, lean=False) for _ in range(3)]
     network = DroidNetwork.random(1).ready(torch.device("cuda"))
-    network._graphs = None
+    # Of the same shapes, which are those of the graphs: a library may sum in another order for others.
+    assert network._graphs is not None
+    network._graphs._works = False
     without = refined(DroidMatcher(network), lean=False)
     for found in with_graphs:
         assert torch.equal(found.target_px, without.target_px)
@@ -64,9 +66,9 @@ def test_graphs_change_nothing_and_runs_are_bitwise_equal(gpu: DroidMatcher) -> 
 def test_kernels_look_up_what_torch_looks_up(dtype: torch.dtype, monkeypatch: pytest.MonkeyPatch) -> None:
     device = torch.device("cuda")
     assert lookup_kernels(device, dtype) is not None
-    generator = torch.Generator(device).manual_seed(0)
-    features = torch.randn(3, 128, 30, 41, generator=generator, device=device).to(dtype)
-    cells = 50 * torch.rand(2, 30, 41, 2, generator=generator, device=device) - 5
+    generator = torch.Generator().manual_seed(0)
+    features = torch.randn(3, 128, 30, 41, generator=generator).to(device, dtype)
+    cells = (50 * torch.rand(2, 30, 41, 2, generator=generator) - 5).to(device)
     source, target = torch.tensor([0, 2], device=device), torch.tensor([1, 0], device=device)
     for correlation in (
         VolumeCorrelation.of(features[source], features[target]),

@@ -2,74 +2,23 @@
 
 from __future__ import annotations
 
-import ctypes
 import io
 import re
-import shutil
-import subprocess
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 import torch
+from lookup_emulator import COMPILER, ORDERS, EmulatedLookups
 
 from vipe_core.ba.cuda.compiler import compile_kernels
 from vipe_core.priors.droid import kernels
 from vipe_core.priors.droid.correlation import FeatureCorrelation, VolumeCorrelation
-from vipe_core.priors.droid.kernels import LookupKernels
-
-DEVICE = Path(__file__).parents[1] / "ba" / "cuda_emulator" / "device.h"
-COMPILER = shutil.which("g++") or shutil.which("clang++")
-
-# What NVRTC knows and the emulator has not needed before.
-PRELUDE = """
-#define __forceinline__ inline
-struct uint4 { unsigned x, y, z, w; };
-"""
-CALLS = {
-    "lookup_volume": "*(value_t**)p[0], *(value_t**)p[1], *(value_t**)p[2], *(value_t**)p[3], *(float**)p[4],"
-    " *(value_t**)p[5], *(long long*)p[6], *(int*)p[7], *(int*)p[8]",
-    "lookup_features": "*(value_t**)p[0], *(value_t**)p[1], *(value_t**)p[2], *(value_t**)p[3], *(long long**)p[4],"
-    " *(long long**)p[5], *(float**)p[6], *(value_t**)p[7], *(int*)p[8], *(int*)p[9]",
-}
 
 
-class Emulated(LookupKernels):
-    """The kernels on a CPU; the order in which threads of a block take turns is a choice."""
-
-    def __init__(self, library: ctypes.CDLL, order: int) -> None:
-        self._library, self._order = library, order
-
-    def _launch(self, kernel: str, blocks: int, threads: int, tensors: Any, numbers: Any) -> None:
-        assert all(tensor.is_contiguous() for tensor in tensors)
-        values = [*(ctypes.c_void_p(tensor.data_ptr()) for tensor in tensors), *numbers]
-        parameters = (ctypes.c_void_p * len(values))(*(ctypes.addressof(value) for value in values))
-        function = getattr(self._library, f"emulate_{kernel}")
-        function.restype = ctypes.c_char_p
-        failure = function(ctypes.c_uint(blocks), ctypes.c_uint(threads), self._order, parameters)
-        assert failure is None, failure
-
-
-@pytest.fixture(scope="module")
-def library(tmp_path_factory: pytest.TempPathFactory) -> ctypes.CDLL:
-    if COMPILER is None:
-        pytest.skip("no C++ compiler to run the kernels with")
-    wrappers = "".join(
-        f'extern "C" const char* emulate_{name}(unsigned blocks, unsigned threads, int order, void** p) {{'
-        f" return emulator::run(blocks, threads, 0, order, [&] {{ {name}({call}); }}); }}\n"
-        for name, call in CALLS.items()
-    )
-    path = tmp_path_factory.mktemp("lookup") / "lookup.so"
-    command = [COMPILER, "-std=c++17", "-O1", "-fno-strict-aliasing", "-U_FORTIFY_SOURCE", "-w", "-shared", "-fPIC"]
-    command += ["-x", "c++", "-include", str(DEVICE), "-", "-o", str(path)]
-    subprocess.run(command, input=PRELUDE + kernels.source(torch.float32) + wrappers, text=True, check=True)
-    return ctypes.CDLL(str(path))
-
-
+@pytest.mark.skipif(COMPILER is None, reason="no C++ compiler to run the kernels with")
 @pytest.mark.parametrize(("height", "width"), [(5, 7), (9, 4), (1, 2)])
 def test_the_kernels_give_what_torch_gives_in_any_order_of_threads(
-    library: ctypes.CDLL, height: int, width: int, monkeypatch: pytest.MonkeyPatch
+    height: int, width: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     rng = np.random.default_rng(height)
     features = torch.from_numpy(rng.standard_normal((3, 128, height, width)).astype(np.float32))
@@ -82,8 +31,8 @@ def test_the_kernels_give_what_torch_gives_in_any_order_of_threads(
     for correlation in (volume, on_the_fly):
         expected = correlation.lookup(cells)
         answers = []
-        for order in range(3):
-            emulated = Emulated(library, order)
+        for order in range(ORDERS):
+            emulated = EmulatedLookups(order)
             with monkeypatch.context() as patched:
                 patched.setattr(
                     "vipe_core.priors.droid.correlation.lookup_kernels", lambda *_, emulated=emulated: emulated
