@@ -45,6 +45,7 @@ from vipe_core.ba import (
     Free,
     Grid,
     Options,
+    Points,
     Priors,
     Problem,
     Result,
@@ -145,8 +146,26 @@ def _rig_scene(focal: bool, own: bool, unified: bool = False) -> tuple[Problem, 
     return problem, replace(truth, cam_from_world=cam_from_rig[rig.view_of_frame] @ moved)
 
 
+def _with_tracks(problem: Problem, start: State, most: int) -> tuple[Problem, State]:
+    """Tracks beside the cells, fewer in every further frame."""
+    rng = torch.Generator().manual_seed(most)
+    grid, edges, frames = problem.grid, problem.edges, len(start.cam_from_world)
+    assert isinstance(grid, Grid)
+    count = (most - torch.arange(frames) * most // frames).long()
+    size = torch.tensor([grid.width, grid.height]) * grid.stride
+    points = Points.beside(grid, torch.rand(frames, most, 2, generator=rng) * size, count)
+    depth = 0.3 + 0.7 * torch.rand(frames, most, generator=rng, dtype=torch.float64)
+    state = replace(start, inverse_depth=torch.cat((start.inverse_depth, depth), dim=1))
+    target_px, valid = reproject(problem.camera_model, points, state, edges.source, edges.target)
+    target_px += 0.3 * torch.randn(target_px.shape, generator=rng, dtype=torch.float64)
+    measured = (valid & points.real()[edges.source])[..., None].expand(target_px.shape).double()
+    prior = Priors(state.inverse_depth, 0.5 * points.real())
+    edges = replace(edges, target_px=target_px, weight=measured)
+    return replace(problem, grid=points, edges=edges, priors=prior), state
+
+
 def _shapes() -> list[tuple[Problem, State, RobustKernel]]:
-    """Both cameras, all sets of intrinsics and kernels, odd numbers of cells, a frame with many edges, rigs."""
+    """Both cameras, all sets of intrinsics and kernels, odd numbers of cells, a frame with many edges, tracks, rigs."""
     kernels: tuple[RobustKernel, ...] = ("none", "huber", "cauchy", "geman_mcclure", "tukey", "truncated")
     shapes = [(4, (5, 13), 2), (6, (9, 15), 3), (9, (16, 20), 4), (3, (1, 7), 2), (27, (3, 5), 26)]
     found: list[tuple[Problem, State, RobustKernel]] = []
@@ -161,6 +180,10 @@ def _shapes() -> list[tuple[Problem, State, RobustKernel]]:
         (True, True, False, "truncated"),
         (True, True, True, "geman_mcclure"),
     )
+    for unified in (False, True):
+        for focal, cells, most in ((False, (5, 13), 200), (True, (3, 5), 9)):
+            problem, start = _with_tracks(*_scene(5, cells, unified, focal, 3), most)
+            found.append((problem, start, "geman_mcclure" if focal else "none"))
     return [*found, *((*_rig_scene(*kind), robust) for *kind, robust in rigs)]
 
 

@@ -22,7 +22,7 @@ import torch
 from torch import Tensor
 
 from benchmarks.peers.transforms import Transforms, scatter_sum
-from vipe_core.ba import Problem, State
+from vipe_core.ba import Grid, Problem, State
 from vipe_core.geometry.quaternion import matrix_from_quaternion, quaternion_from_matrix
 
 # It scales weights by this.
@@ -48,6 +48,11 @@ class _OnAnyDevice(InspectLoader):
     def get_source(self, fullname: str) -> str:
         source = self._path.read_text().replace("Gij.data[:, ii == jj] = torch.as_tensor(", "(")
         return source.replace('1.0], device="cuda"', "1.0]")
+
+
+def _grid(problem: Problem) -> Grid:
+    assert isinstance(problem.grid, Grid)
+    return problem.grid
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,19 +105,19 @@ class Droid:
 
     def _measured(self, problem: Problem) -> tuple[Tensor, Tensor]:
         """Targets and weights (E, h, w, 2) on its grid."""
-        grid, edges = problem.grid, problem.edges
+        grid, edges = _grid(problem), problem.edges
         shape = (len(edges.source), grid.height, grid.width, 2)
         target = ((edges.target_px - grid.offset) / grid.stride).float()
         return target.view(shape), (edges.weight * (grid.stride**2 / _WEIGHT_SCALE)).float().view(shape)
 
     def _camera(self, problem: Problem, state: State) -> Tensor:
         camera = state.intrinsics.float().clone()
-        camera[2:] -= problem.grid.offset
-        return camera / problem.grid.stride
+        camera[2:] -= _grid(problem).offset
+        return camera / _grid(problem).stride
 
     def _python_step(self, problem: Problem, state: State, damping: float) -> State:
         """Its damping is what it is."""
-        grid, edges, count = problem.grid, problem.edges, len(state.cam_from_world)
+        grid, edges, count = _grid(problem), problem.edges, len(state.cam_from_world)
         target, weight = self._measured(problem)
         eta = torch.full((1, len(torch.unique(edges.source)), grid.height * grid.width), _LEAST_CURVATURE)
         poses, depths = self.python(
@@ -129,7 +134,7 @@ class Droid:
         return State(poses.data[0].double(), depths.view(count, -1), state.intrinsics)
 
     def _extension_step(self, problem: Problem, state: State, damping: float) -> State:
-        grid, edges, count = problem.grid, problem.edges, len(state.cam_from_world)
+        grid, edges, count = _grid(problem), problem.edges, len(state.cam_from_world)
         device = state.inverse_depth.device
         target, weight = (each.permute(0, 3, 1, 2).contiguous() for each in self._measured(problem))
         world = state.cam_from_world

@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from benchmarks.peers.transforms import Transforms, scatter_sum
-from vipe_core.ba import Problem, State
+from vipe_core.ba import Grid, Problem, State
 
 
 def load(folder: Path) -> dict[str, Any]:
@@ -54,6 +54,7 @@ def load(folder: Path) -> dict[str, Any]:
 def iteration(vipe: dict[str, Any], problem: Problem, state: State, damping: float) -> Callable[[], State]:
     """One Gauss-Newton iteration of a pinhole problem from a state, as often as called; each gives the state after."""
     grid, edges, free = problem.grid, problem.edges, problem.free
+    assert isinstance(grid, Grid)
     device, count = state.inverse_depth.device, len(edges.source)
     target = ((edges.target_px - grid.offset) / grid.stride).float()
     weight = (edges.weight * grid.stride**2).float()

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import torch
 
-from vipe_core.ba import Edges, Free, Grid, Priors, Problem, State, reproject
+from vipe_core.ba import Edges, Free, Grid, Points, Priors, Problem, State, reproject
 from vipe_core.cameras import CameraModel
 from vipe_core.geometry import se3
 
@@ -68,10 +68,44 @@ def with_noise(problem: Problem, sigma_px: float, seed: int = 2) -> Problem:
 
 
 def with_depth_prior(problem: Problem, value: torch.Tensor, weight: float) -> Problem:
-    return replace(
-        problem,
-        priors=replace(problem.priors, inverse_depth=value, inverse_depth_weight=torch.full_like(value, weight)),
+    information = torch.full_like(value, weight)
+    if isinstance(problem.grid, Points):
+        information *= problem.grid.real()
+    return replace(problem, priors=replace(problem.priors, inverse_depth=value, inverse_depth_weight=information))
+
+
+def with_tracks(
+    problem: Problem, truth: State, most: int = 9, seed: int = 5, *, alone: bool = False
+) -> tuple[Problem, State]:
+    """Exactly measured tracks beside the cells of the grid, or alone: up to `most` in a frame, none in its first.
+
+    A third of the tracks is not seen by an edge. What fills up has inverse depths far from all others.
+    """
+    rng = torch.Generator().manual_seed(seed)
+    grid, edges, frames = problem.grid, problem.edges, len(truth.cam_from_world)
+    assert isinstance(grid, Grid)
+    count = torch.randint(0, most + 1, (frames,), generator=rng)
+    count[0], count[-1] = 0, most
+    size = torch.tensor([grid.width, grid.height], dtype=torch.float64) * grid.stride
+    px = torch.rand(frames, most, 2, generator=rng, dtype=torch.float64) * size - 0.5
+    real = torch.arange(most) < count[:, None]
+    depth = 0.3 + 0.7 * torch.rand(frames, most, generator=rng, dtype=torch.float64)
+    tracks = replace(truth, inverse_depth=torch.where(real, depth, 1e7))
+    target_px, valid = reproject(
+        problem.camera_model, Points(px, count), tracks, edges.source, edges.target, rig=problem.rig
     )
+    seen = valid & real[edges.source] & (torch.rand(valid.shape, generator=rng) < 0.7)
+    weight = 0.2 + torch.rand(target_px.shape, generator=rng, dtype=torch.float64)
+    measured = replace(edges, target_px=target_px, weight=weight * seen[..., None])
+    if alone:
+        return replace(problem, grid=Points(px, count), edges=measured), tracks
+    measured = replace(
+        edges,
+        target_px=torch.cat((edges.target_px, measured.target_px), dim=1),
+        weight=torch.cat((edges.weight, measured.weight), dim=1),
+    )
+    both = torch.cat((truth.inverse_depth, tracks.inverse_depth), dim=1)
+    return replace(problem, grid=Points.beside(grid, px, count), edges=measured), replace(truth, inverse_depth=both)
 
 
 def float32(problem: Problem, state: State) -> tuple[Problem, State]:
@@ -80,4 +114,4 @@ def float32(problem: Problem, state: State) -> tuple[Problem, State]:
     return replace(problem, edges=edges), replace(state, inverse_depth=state.inverse_depth.float())
 
 
-__all__ = ["Priors", "disturbed", "float32", "scene", "with_depth_prior", "with_noise"]
+__all__ = ["Priors", "disturbed", "float32", "scene", "with_depth_prior", "with_noise", "with_tracks"]

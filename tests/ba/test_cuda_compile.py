@@ -26,11 +26,12 @@ from vipe_core.ba.cuda.compiler import (
 pytest.importorskip("cuda.core", reason="cuda-core compiles the kernels")
 pytest.importorskip("cuda.bindings.nvrtc", reason="NVRTC compiles the kernels")
 
-# Both cameras, one, two and the most intrinsics that there can be, every architecture.
+# Both cameras, one, two and the most intrinsics that there can be, points, every architecture.
 _SAMPLE = (
     ("sm_80", Specialisation(True, True, False, "tukey")),
     ("sm_90", Specialisation(False, True, False, "geman_mcclure")),
     ("sm_120", Specialisation(True, True, True, "cauchy", apart=True)),
+    ("sm_120", Specialisation(True, True, True, "cauchy", points=True)),
 )
 
 
@@ -55,8 +56,8 @@ def test_what_is_wrong_with_a_kernel_is_told() -> None:
     assert len(faults("tile", Usage(registers=256, spilled=4, stack=8, shared=1 << 16), kind)) == 5
 
 
-def test_there_is_a_specialisation_for_every_camera_intrinsics_and_robust_kernel() -> None:
-    assert len(set(specialisations())) == (6 + 4) * 6
+def test_there_is_a_specialisation_for_every_camera_intrinsics_robust_kernel_and_points() -> None:
+    assert len(set(specialisations())) == (6 + 4) * 6 * 2
 
 
 def test_compiled_code_is_kept(tmp_path: Path) -> None:

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 import torch
-from ba_scenes import disturbed, float32, scene, with_depth_prior, with_noise
+from ba_scenes import disturbed, float32, scene, with_depth_prior, with_noise, with_tracks
 from rig_scenes import disturbed_rig, rig_scene
 
 from vipe_core.ba import Options, Priors, Problem, Result, State, Status, levenberg, operator, solve
@@ -22,6 +22,11 @@ def plain() -> tuple[Problem, State]:
     return float32(problem, disturbed(truth))
 
 
+def tracks() -> tuple[Problem, State]:
+    problem, truth = with_tracks(*scene("mei", num_frames=3, height=3, width=4))
+    return float32(with_noise(problem, 0.1), disturbed(truth))
+
+
 def rig() -> tuple[Problem, State]:
     problem, truth = rig_scene(num_poses=3, own_intrinsics=True, height=3, width=4)
     sigma = torch.tensor([[0.1, 0.2], [0.3, 0.4]])
@@ -30,14 +35,14 @@ def rig() -> tuple[Problem, State]:
     return replace(with_noise(problem, 0.05), free=free, priors=prior), disturbed_rig(problem, truth)
 
 
-@pytest.mark.parametrize("case", [plain, rig])
+@pytest.mark.parametrize("case", [plain, tracks, rig])
 def test_torch_accepts_the_operator(case: Any) -> None:
     """Its schema, that it neither changes nor returns what it is given, and the shapes that its fake foretells."""
     arguments = operator._arguments(*case(), Options(max_iterations=2))
     torch.library.opcheck(torch.ops.vipe_core.bundle_adjustment.default, arguments)
 
 
-@pytest.mark.parametrize("case", [plain, rig])
+@pytest.mark.parametrize("case", [plain, tracks, rig])
 def test_what_is_asked_arrives(case: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     """Every field of problem, state and options, none of them at its default."""
     problem, state = case()
@@ -71,7 +76,7 @@ def _equal(one: Any, other: Any) -> bool:
     return bool(one == other)
 
 
-@pytest.mark.parametrize("case", [plain, rig])
+@pytest.mark.parametrize("case", [plain, tracks, rig])
 def test_an_answer_says_what_the_result_does(case: Any) -> None:
     problem, state = case()
     result = levenberg.descend(problem, state, Options(max_iterations=2))

@@ -19,9 +19,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from vipe_core.ba import block_cholesky, kernels, robust
-from vipe_core.ba.problem import Options, Problem, State
+from vipe_core.ba.problem import Options, Points, Problem, State
 from vipe_core.ba.reduced import add_frames, add_twists, damp
-from vipe_core.ba.reprojection import cameras_of, min_depth_factor
+from vipe_core.ba.reprojection import cameras_of, median_inverse_depth, rays_of
 from vipe_core.ba.rigs import extrinsic_prior, moved_poses, turns_of, unknowns_of
 from vipe_core.ba.rules import ALPHA_RANGE, MAX_LOG_FOCAL_STEP
 from vipe_core.ba.solver import Cost, Step
@@ -79,12 +79,17 @@ class HostSolver:
         np.cumsum(degree.numpy(), out=first[1:])
         depth_free = (free.inverse_depth.cpu() & (degree > 0)).numpy()
         self._depth_free = depth_free
+        self._camera_of = camera_of
+        grid = problem.grid
+        real = grid.count.cpu() if isinstance(grid, Points) else torch.full((num_frames,), grid.num_cells)
         self._graph = kernels.Graph(
             first=first,
             edge=order.numpy(),
             target_px=_flat(edges.target_px, dtype),
             weight=_flat(edges.weight, dtype),
             depth_free=depth_free,
+            num_cells=real.numpy(),
+            table=(torch.arange(num_frames) if isinstance(grid, Points) else camera_of).numpy(),
             source_camera=camera_of.numpy(),
             target_camera=camera_of[self._target].numpy(),
         )
@@ -115,9 +120,11 @@ class HostSolver:
         self._sample_px = problem.grid.sample_px()
         self._rays: tuple[Tensor, Array, Array, Array] | None = None
         self._seen: tuple[State, kernels.Pose, Tensor] | None = None
-        median = state.inverse_depth.median()
+        median = median_inverse_depth(grid, state.inverse_depth)
         self._depth_range = (options.min_inverse_depth * median, options.max_inverse_depth * median)
-        cells = len(self._source) * problem.grid.num_cells
+        held = torch.from_numpy(~depth_free)
+        self._held = held[:, None] | ~grid.real() if isinstance(grid, Points) else held
+        cells = len(self._source) * grid.num_cells
         self._threads = max(1, min(torch.get_num_threads(), cells // _CELLS_PER_THREAD))
 
     def _depth_prior(self, dtype: torch.dtype) -> kernels.DepthPrior:
@@ -187,16 +194,12 @@ class HostSolver:
         model, intrinsics = self.problem.camera_model, state.intrinsics.reshape(self._num_cameras, -1)
         transform = se3.relative(state.cam_from_world[self._target], state.cam_from_world[self._source])
         if self._rays is None or not torch.equal(self._rays[0], intrinsics):
-            tables = torch.empty(self._num_cameras, 3, len(self._sample_px), dtype=self._dtype)
-            slopes = torch.zeros(self._num_cameras, 2, 3, len(self._sample_px), dtype=self._dtype)
-            floors = torch.empty(self._num_cameras, len(self._sample_px), dtype=self._dtype)
-            for number, camera in enumerate(intrinsics):
-                rays = projection.unproject(model, camera, self._sample_px)
-                by_intrinsics = projection.unproject_jacobian(model, camera, self._sample_px)
-                tables[number] = rays.T
-                slopes[number, : by_intrinsics.shape[2]] = by_intrinsics.permute(2, 1, 0)
-                floors[number] = min_depth_factor(model, camera, self._sample_px, rays, self.options.min_depth_ratio)
-            self._rays = (intrinsics.clone(), tables.numpy(), slopes.numpy(), floors.numpy())
+            through = rays_of(model, self._sample_px, intrinsics, self._camera_of, self.options.min_depth_ratio)
+            by_intrinsics = projection.unproject_jacobian(model, through.params, self._sample_px).permute(0, 3, 2, 1)
+            slopes = torch.zeros(len(by_intrinsics), 2, *by_intrinsics.shape[2:], dtype=self._dtype)
+            slopes[:, : by_intrinsics.shape[1]] = by_intrinsics
+            tables = through.rays.mT.to(self._dtype).contiguous()
+            self._rays = (intrinsics.clone(), tables.numpy(), slopes.numpy(), through.min_s.to(self._dtype).numpy())
         cameras = torch.zeros(self._num_cameras, 5, dtype=self._dtype)
         cameras[:, : intrinsics.shape[1]] = intrinsics
         return (
@@ -434,8 +437,7 @@ class HostSolver:
         if self._free[1]:
             intrinsics[..., 4] += step.alpha
         inverse_depth = (state.inverse_depth + step.inverse_depth).clamp_(*self._depth_range)
-        held = torch.from_numpy(~self._depth_free)
-        inverse_depth[held] = state.inverse_depth[held]
+        inverse_depth[self._held] = state.inverse_depth[self._held]
         cam_from_world, cam_from_rig = moved_poses(self.problem, state, step)
         return State(cam_from_world, inverse_depth, intrinsics, cam_from_rig)
 

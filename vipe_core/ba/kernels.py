@@ -47,8 +47,8 @@ _JACOBIAN_SIZE = 32 * TILE
 class Graph(NamedTuple):
     """Edges in order of (source, target): `edge` (E,) numbers the problem's, those of frame i are first[i]:first[i+1].
 
-    target_px and weight are (E, 2 P) in the problem's order, (u, v) alternating; depth_free (N,) bool. Which intrinsics
-    are meant say source_camera (N,) and, in order, target_camera (E,).
+    target_px and weight are (E, 2 P) in the problem's order, (u, v) alternating; depth_free (N,) bool; num_cells (N,)
+    at most P. Which rays and intrinsics are meant say table (N,), source_camera (N,) and, in order, target_camera (E,).
     """
 
     first: Array
@@ -56,14 +56,16 @@ class Graph(NamedTuple):
     target_px: Array
     weight: Array
     depth_free: Array
+    num_cells: Array
+    table: Array
     source_camera: Array
     target_camera: Array
 
 
 class Pose(NamedTuple):
-    """A state: transform (E, 12) rows of [R | t] in order, rays (C, 3, P), their derivatives (C, 2, 3, P).
+    """A state: transform (E, 12) rows of [R | t] in order, rays (T, 3, P), their derivatives (T, 2, 3, P).
 
-    min_s (C, P), inverse_depth (N, P), camera (C, 5) with (fx, fy, cx, cy, alpha), all of one dtype.
+    min_s (T, P), inverse_depth (N, P), camera (C, 5) with (fx, fy, cx, cy, alpha), all of one dtype.
     """
 
     transform: Array
@@ -86,9 +88,9 @@ def _see(graph: Graph, pose: Pose, frame: int, order: int, start: int, n: int, v
     """Fill the view of an edge's tile; returns the sum of the larger weights, imaged or not."""
     row, edge = pose.transform[order], graph.edge[order]
     target, weight = graph.target_px[edge][2 * start : 2 * (start + n)], graph.weight[edge][2 * start : 2 * (start + n)]
-    rays, camera = pose.rays[graph.source_camera[frame]], pose.camera[graph.target_camera[order]]
+    rays, camera = pose.rays[graph.table[frame]], pose.camera[graph.target_camera[order]]
     rx, ry, rz = rays[0][start:], rays[1][start:], rays[2][start:]
-    depth, least = pose.inverse_depth[frame][start:], pose.min_s[graph.source_camera[frame]][start:]
+    depth, least = pose.inverse_depth[frame][start:], pose.min_s[graph.table[frame]][start:]
     fx, fy, cx, cy, alpha = camera[0], camera[1], camera[2], camera[3], camera[4]
     r00, r01, r02, t0 = row[0], row[1], row[2], row[3]
     r10, r11, r12, t1 = row[4], row[5], row[6], row[7]
@@ -237,7 +239,7 @@ def _differentiate(
         jacobian[_BY_POINT + 4 * TILE + p], jacobian[_BY_POINT + 5 * TILE + p] = u2, v2
     for k in range(2):
         if free[k]:
-            rays = pose.rays_by_intrinsics[graph.source_camera[frame], k]
+            rays = pose.rays_by_intrinsics[graph.table[frame], k]
             if free[2]:
                 _apart_rows(rays, camera, row, k, start, n, view, jacobian)
             else:
@@ -398,13 +400,13 @@ def evaluate(
         scale: (2,) squares of the kernel's scale and of the one it ends at, px^2.
         sums: (N, 4) float64 zeros, filled with wmax rho(s), wmax of what is imaged, all wmax, and the prior's cost.
     """
-    cells = pose.rays.shape[2]
     view, pull, weight = (
         np.empty(_VIEW_SIZE, pose.rays.dtype),
         np.empty(TILE, pose.rays.dtype),
         np.empty(TILE, pose.rays.dtype),
     )
     for frame in range(begin, end):
+        cells = graph.num_cells[frame]
         for start in range(0, cells, TILE):
             n = min(TILE, cells - start)
             for order in range(graph.first[frame], graph.first[frame + 1]):
@@ -445,7 +447,7 @@ def linearise(
             eliminating the undamped depths subtracts; rows are the twists of the edges, then log f and alpha of every
             camera and one more, which is the right-hand side of the first camera and zero of others.
     """
-    cells, dtype = pose.rays.shape[2], pose.rays.dtype
+    dtype = pose.rays.dtype
     most = 0
     for frame in range(begin, end):
         most = max(most, graph.first[frame + 1] - graph.first[frame])
@@ -458,7 +460,7 @@ def linearise(
         first, last = graph.first[frame], graph.first[frame + 1]
         degree = last - first
         size = 6 * degree + tail
-        depth_free = graph.depth_free[frame]
+        depth_free, cells = graph.depth_free[frame], graph.num_cells[frame]
         for start in range(0, cells, TILE):
             n = min(TILE, cells - start)
             if depth_free:
@@ -518,7 +520,7 @@ def _follow(
         change[p] = zero
     for k in range(2):
         if twist[6 + k] != 0:
-            rays = pose.rays_by_intrinsics[graph.source_camera[frame], k]
+            rays = pose.rays_by_intrinsics[graph.table[frame], k]
             rx, ry, rz = rays[0][start:], rays[1][start:], rays[2][start:]
             step = twist[6 + k]
             for p in range(n):
@@ -571,12 +573,12 @@ def back_substitute(
         step: (N, P) filled where depths are free.
         gain: (N,) float64, filled with gradient times step.
     """
-    cells, dtype = pose.rays.shape[2], pose.rays.dtype
+    dtype = pose.rays.dtype
     view, change, sums = np.zeros(_VIEW_SIZE, dtype), np.zeros(3 * TILE, dtype), np.zeros(3 * TILE, dtype)
     zero, one, tiny = dtype.type(0), dtype.type(1), dtype.type(_TINY)
     for frame in range(begin, end):
         first, last = graph.first[frame], graph.first[frame + 1]
-        gain[frame] = 0
+        gain[frame], cells = 0, graph.num_cells[frame]
         if not graph.depth_free[frame] or first == last:
             continue
         for start in range(0, cells, TILE):

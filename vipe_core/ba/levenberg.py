@@ -18,7 +18,7 @@ from torch import Tensor
 
 from vipe_core.ba import robust
 from vipe_core.ba.host_solver import HostSolver
-from vipe_core.ba.problem import NO_COVARIANCE, Covariance, Edges, Options, Problem, Result, Rig, State, Status
+from vipe_core.ba.problem import NO_COVARIANCE, Covariance, Edges, Options, Points, Problem, Result, Rig, State, Status
 from vipe_core.ba.reprojection import require_supported
 from vipe_core.ba.rules import (
     ACCEPTED_FACTOR,
@@ -255,13 +255,18 @@ def _on_device(problem: Problem, state: State) -> tuple[Problem, State]:
             inverse_depth_weight=priors.inverse_depth_weight.to(device),
         )
     edges = Edges(edges.source.to(device), edges.target.to(device), edges.target_px.to(device), edges.weight.to(device))
-    return replace(problem, edges=edges, priors=priors, rig=rig), state
+    grid = problem.grid
+    if isinstance(grid, Points):
+        grid = Points(grid.px.to(device), grid.count.to(device))
+    return replace(problem, grid=grid, edges=edges, priors=priors, rig=rig), state
 
 
 def _finite(problem: Problem, state: State) -> bool:
     """Whether state and priors are finite. Measurements with a weight that are not make the cost so."""
     priors = problem.priors
     tensors = [state.cam_from_world, state.inverse_depth, state.intrinsics]
+    if isinstance(problem.grid, Points):
+        tensors.append(problem.grid.px)
     if problem.rig is not None and state.cam_from_rig is not None:
         tensors.append(state.cam_from_rig)
     checks = [tensor.isfinite().all() for tensor in tensors]

@@ -20,7 +20,7 @@ from torch import Tensor
 
 from vipe_core.ba import cuda, levenberg
 from vipe_core.ba.answer import Answer, answer_of, report_size, result_of
-from vipe_core.ba.problem import Edges, Free, Grid, Options, Priors, Problem, Result, Rig, RobustKernel, State
+from vipe_core.ba.problem import Edges, Free, Grid, Options, Points, Priors, Problem, Result, Rig, RobustKernel, State
 from vipe_core.cameras import CameraModel
 
 
@@ -55,11 +55,14 @@ def _arguments(problem: Problem, state: State, options: Options) -> tuple[Any, .
     where the inverse depths are."""
     device = state.inverse_depth.device
     edges, free, priors, rig = problem.edges, problem.free, problem.priors, problem.rig
-    log_focal = priors.log_focal
+    grid, log_focal = problem.grid, priors.log_focal
+    points = grid if isinstance(grid, Points) else None
     return (
         problem.camera_model,
-        [problem.grid.height, problem.grid.width],
-        [problem.grid.stride, problem.grid.offset],
+        [] if isinstance(grid, Points) else [grid.height, grid.width],
+        [] if isinstance(grid, Points) else [grid.stride, grid.offset],
+        None if points is None else points.px.to(device),
+        None if points is None else points.count.cpu(),
         edges.source.cpu(),
         edges.target.cpu(),
         edges.target_px.to(device),
@@ -97,6 +100,8 @@ def _problem(
     camera_model: str,
     grid_cells: Sequence[int],
     grid_px: Sequence[float],
+    points_px: Tensor | None,
+    points_count: Tensor | None,
     source: Tensor,
     target: Tensor,
     target_px: Tensor,
@@ -126,7 +131,7 @@ def _problem(
     tolerance, scale_px, damping, least_depth, most_depth, depth_ratio = settings
     problem = Problem(
         cast("CameraModel", camera_model),
-        Grid(*grid_cells, *grid_px),
+        Grid(*grid_cells, *grid_px) if points_px is None or points_count is None else Points(points_px, points_count),
         Edges(source, target, target_px, weight),
         Free(free_poses, free_depths, *free),
         Priors(
@@ -155,9 +160,9 @@ def _problem(
 
 # As `_problem`, and `Answer`.
 _SCHEMA = (
-    "(str camera_model, int[] grid_cells, float[] grid_px, Tensor source, Tensor target, Tensor target_px, "
-    "Tensor weight, Tensor free_poses, Tensor free_depths, bool[] free, Tensor? prior_depth, "
-    "Tensor? prior_depth_weight, float[] prior_log_focal, Tensor? prior_cam_from_rig, "
+    "(str camera_model, int[] grid_cells, float[] grid_px, Tensor? points_px, Tensor? points_count, Tensor source, "
+    "Tensor target, Tensor target_px, Tensor weight, Tensor free_poses, Tensor free_depths, bool[] free, "
+    "Tensor? prior_depth, Tensor? prior_depth_weight, float[] prior_log_focal, Tensor? prior_cam_from_rig, "
     "float prior_log_focal_sigma, Tensor? prior_extrinsic_sigma, "
     "Tensor? pose_of_frame, Tensor? view_of_frame, Tensor cam_from_world, Tensor inverse_depth, Tensor intrinsics, "
     "Tensor? cam_from_rig, str robust, int max_iterations, float? initial_scale_px, float[] settings) "

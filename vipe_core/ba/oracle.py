@@ -59,6 +59,8 @@ def newton_step(problem: Problem, state: State, options: Options, damping: float
     sizes = [6 * num_poses, 6 * num_views, num_cameras, num_cameras, num_frames * num_cells]
     num_shared = sum(sizes[:-1])
     sample_px = problem.grid.sample_px()
+    if sample_px.ndim == 3:
+        sample_px = sample_px[edges.source]
     sqrt_weight = edges.weight.double().sqrt()
     start = torch.zeros(len(moving), dtype=torch.float64)
 

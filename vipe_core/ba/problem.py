@@ -1,11 +1,12 @@
 """What a bundle adjustment is asked: measurements, state, what is free, and how the answer comes back.
 
 Solver-independent. One `Problem` is a graph of directed edges between frames. Edge e = (i -> j) measures, for every
-cell p of the source grid, where the point behind p is seen in frame j:
+cell p of the source frame, where the point behind p is seen in frame j:
 
     r_e(p) = project(G_j G_i^-1 (ray(p), d_i(p)); K) - target_e(p)        weighted per component by weight_e(p)
 
-with G = cam_from_world and d the inverse depth along the ray that the camera model returns (z = 1 for pinhole).
+with G = cam_from_world and d the inverse depth along the ray that the camera model returns (z = 1 for pinhole). Cells
+are those of a grid, the same in every frame, or points of each frame's own.
 Frames that are views of one rigid rig share its pose: G_n = cam_from_rig[view of n] rig_from_world[pose of n] (section
 3.2.6); such a problem has a `Rig`, and may have intrinsics per view.
 Units: pixels of the working image (integer pixel indices), inverse depth in 1 / world unit.
@@ -53,6 +54,42 @@ class Grid:
             indexing="ij",
         )
         return torch.stack((u.reshape(-1), v.reshape(-1)), dim=-1)
+
+
+@dataclass(frozen=True, slots=True)
+class Points:
+    """Places of a frame's own that carry an inverse depth: those of tracks alone, or of a grid and then of tracks.
+
+    Attributes:
+        px: (N, P, 2) finite index coordinates (u, v) in the working image.
+        count: (N,) int64 how many of a frame's are real, from its first on. What is behind them fills up: it is finite,
+            nothing gives it weight, and its inverse depth stays.
+    """
+
+    px: Tensor
+    count: Tensor
+
+    def __post_init__(self) -> None:
+        if self.px.ndim != 3 or self.px.shape[2] != 2 or self.count.shape != self.px.shape[:1]:
+            raise ValueError(f"points disagree in shape: {self.px.shape = }, {self.count.shape = }")
+
+    @classmethod
+    def beside(cls, grid: Grid, px: Tensor, count: Tensor) -> Points:
+        """The cells of a grid, then points of each frame: (N, M, 2) of which (N,) are real."""
+        cells = grid.sample_px(px.dtype, px.device).expand(len(px), -1, -1)
+        return cls(torch.cat((cells, px), dim=1), count + grid.num_cells)
+
+    @property
+    def num_cells(self) -> int:
+        return int(self.px.shape[1])
+
+    def sample_px(self, dtype: torch.dtype = torch.float64, device: torch.device | str = "cpu") -> Tensor:
+        """(N, P, 2) index coordinates (u, v)."""
+        return self.px.to(device, dtype)
+
+    def real(self, device: torch.device | str = "cpu") -> Tensor:
+        """(N, P) bool."""
+        return torch.arange(self.num_cells, device=device) < self.count.to(device)[:, None]
 
 
 @dataclass(frozen=True, slots=True)
@@ -170,7 +207,7 @@ class Problem:
     """
 
     camera_model: CameraModel
-    grid: Grid
+    grid: Grid | Points
     edges: Edges
     free: Free
     priors: Priors = field(default_factory=Priors)

@@ -1,11 +1,13 @@
-"""The measurement model outside of the solver: where a state sees the cells of a source frame in a target frame."""
+"""The measurement model outside of the solvers: rays through cells, and where a state sees them in a target frame."""
 
 from __future__ import annotations
+
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from vipe_core.ba.problem import Grid, Options, Problem, Rig, State
+from vipe_core.ba.problem import Grid, Options, Points, Problem, Rig, State
 from vipe_core.cameras import CameraModel, projection
 from vipe_core.errors import ConfigError
 from vipe_core.geometry import se3
@@ -21,16 +23,47 @@ def require_supported(camera_model: CameraModel) -> None:
         raise ConfigError(f"bundle adjustment takes pinhole and mei cameras, not {camera_model!r}")
 
 
-def min_depth_factor(
-    camera_model: CameraModel, intrinsics: Tensor, sample_px: Tensor, rays: Tensor, min_depth_ratio: float
-) -> Tensor:
-    """(P,) smallest s = z + alpha |X| at which a transformed point still counts; infinite where a cell has no ray.
+class Rays(NamedTuple):
+    """Rays through cells in float64: T tables, one for each camera, or for each frame where it has its own points.
 
-    For a pinhole camera s starts at one and this is the ratio itself.
+    Attributes:
+        of_frame: (N,) int64 which table a frame has.
+        params: (K, T, 1) intrinsics, as `projection` takes them for all tables at once.
+        px: (P, 2) or (T, P, 2) index coordinates of the cells.
+        rays: (T, P, 3).
+        min_s: (T, P) smallest s = z + alpha |X| at which a transformed point still counts; infinite where a cell has no
+            ray. For a pinhole camera s starts at one and this is `Options.min_depth_ratio` itself.
     """
-    s, _ = projection.depth_factor(camera_model, intrinsics, rays)
-    on_disk = projection.on_image_disk(camera_model, intrinsics, sample_px) & (s > 0)
-    return torch.where(on_disk, min_depth_ratio * s, torch.inf)
+
+    of_frame: Tensor
+    params: Tensor
+    px: Tensor
+    rays: Tensor
+    min_s: Tensor
+
+
+def rays_of(camera_model: CameraModel, px: Tensor, cameras: Tensor, camera_of: Tensor, min_depth_ratio: float) -> Rays:
+    """Rays through the cells of every frame.
+
+    Args:
+        px: `Grid.sample_px` or `Points.sample_px`.
+        cameras, camera_of: As from `cameras_of`.
+    """
+    of_frame = camera_of
+    if px.ndim == 3:
+        cameras, of_frame = cameras[camera_of], torch.arange(len(px), device=px.device)
+    params = cameras.T[..., None]
+    rays = projection.unproject(camera_model, params, px)
+    s, _ = projection.depth_factor(camera_model, params, rays)
+    on_disk = projection.on_image_disk(camera_model, params, px) & (s > 0)
+    return Rays(of_frame, params, px, rays, torch.where(on_disk, min_depth_ratio * s, torch.inf))
+
+
+def median_inverse_depth(grid: Grid | Points, inverse_depth: Tensor) -> Tensor:
+    """0-dim median of (N, P) inverse depths but for those that fill up."""
+    if isinstance(grid, Grid):
+        return inverse_depth.median()
+    return torch.where(grid.real(inverse_depth.device), inverse_depth, torch.nan).nanmedian()
 
 
 def cameras_of(intrinsics: Tensor, rig: Rig | None, num_frames: int) -> tuple[Tensor, Tensor]:
@@ -42,7 +75,7 @@ def cameras_of(intrinsics: Tensor, rig: Rig | None, num_frames: int) -> tuple[Te
 
 def reproject(
     camera_model: CameraModel,
-    grid: Grid,
+    grid: Grid | Points,
     state: State,
     source: Tensor,
     target: Tensor,
@@ -53,7 +86,7 @@ def reproject(
 
     Args:
         camera_model: `pinhole` or `mei`.
-        grid: The cells.
+        grid: The cells, or the points of each frame.
         state: Poses, inverse depths and intrinsics.
         source: (E,) int64 source frames.
         target: (E,) int64 target frames.
@@ -70,15 +103,10 @@ def reproject(
     require_supported(camera_model)
     dtype, device = state.inverse_depth.dtype, state.inverse_depth.device
     cameras, camera_of = cameras_of(state.intrinsics.to(device), rig, len(state.cam_from_world))
-    sample_px = grid.sample_px(device=device)
-    tables = [projection.unproject(camera_model, camera, sample_px) for camera in cameras]
-    floors = [
-        min_depth_factor(camera_model, camera, sample_px, rays, min_depth_ratio).to(dtype)
-        for camera, rays in zip(cameras, tables, strict=True)
-    ]
+    through = rays_of(camera_model, grid.sample_px(device=device), cameras, camera_of, min_depth_ratio)
+    tables, floors, params_of = through.rays.to(dtype), through.min_s.to(dtype), cameras.to(dtype)
     target_from_source = se3.relative(state.cam_from_world[target], state.cam_from_world[source]).to(dtype)
-    rays_of, floor_of, params_of = torch.stack(tables).to(dtype), torch.stack(floors), cameras.to(dtype)
-    alone = len(cameras) == 1
+    alone, one_table = len(cameras) == 1, len(tables) == 1
 
     cells = grid.num_cells
     px = torch.empty(len(source), cells, 2, dtype=dtype, device=device)
@@ -87,9 +115,9 @@ def reproject(
     for start in range(0, len(source), batch):
         edges = slice(start, start + batch)
         transform = target_from_source[edges]
-        seen_from, seen_in = camera_of[source[edges]], camera_of[target[edges]]
-        rays = rays_of[0] if alone else rays_of[seen_from]
-        floor = floor_of[0] if alone else floor_of[seen_from]
+        seen_from, seen_in = through.of_frame[source[edges]], camera_of[target[edges]]
+        rays = tables[0] if one_table else tables[seen_from]
+        floor = floors[0] if one_table else floors[seen_from]
         # One column per edge, so that the camera functions take them as numbers.
         params = params_of[0] if alone else params_of[seen_in].T[..., None]
         points = rays @ transform[:, :3, :3].mT

@@ -54,8 +54,8 @@ from torch import Tensor
 
 from vipe_core.ba import robust
 from vipe_core.ba.plan import Chunk, build_plan
-from vipe_core.ba.problem import Options, Problem, State
-from vipe_core.ba.reprojection import cameras_of, min_depth_factor
+from vipe_core.ba.problem import Options, Points, Problem, State
+from vipe_core.ba.reprojection import cameras_of, median_inverse_depth, rays_of
 from vipe_core.ba.rigs import extrinsic_prior, moved_poses, turns_of
 from vipe_core.ba.rules import ALPHA_RANGE, MAX_LOG_FOCAL_STEP, MIN_CURVATURE
 from vipe_core.ba.solver import Cost, Step
@@ -126,9 +126,11 @@ class Linearisation:
 
 
 class _Geometry:
-    """What depends on poses and intrinsics only: transforms per edge, rays per camera and cell."""
+    """What depends on poses and intrinsics only: transforms per edge, rays per table (`reprojection.Rays`) and cell."""
 
-    def __init__(self, problem: Problem, options: Options, state: State, sample_px: Tensor, cameras: Tensor) -> None:
+    def __init__(
+        self, problem: Problem, options: Options, state: State, sample_px: Tensor, cameras: Tensor, camera_of: Tensor
+    ) -> None:
         model, dtype = problem.camera_model, state.inverse_depth.dtype
         source_from_world = state.cam_from_world[problem.edges.source]
         transform = se3.relative(state.cam_from_world[problem.edges.target], source_from_world)
@@ -136,20 +138,21 @@ class _Geometry:
         self.turn = turns_of(problem, state)
         self.rotation = transform[:, :3, :3].to(dtype)
         self.translation = transform[:, :3, 3:].to(dtype)
-        tables, slopes, floors = [], [], []
-        for camera in cameras:
-            rays = projection.unproject(model, camera, sample_px)
-            floors.append(min_depth_factor(model, camera, sample_px, rays, options.min_depth_ratio).to(dtype))
-            slopes.append(projection.unproject_jacobian(model, camera, sample_px).permute(2, 1, 0).to(dtype))
-            tables.append(rays.mT.to(dtype))
-        # (C, 3, P), (C, n, 3, P), (C, P).
-        self.rays = torch.stack(tables).contiguous()
-        self.rays_by_intrinsics = torch.stack(slopes).contiguous()
-        self.min_s = torch.stack(floors)
+        through = rays_of(model, sample_px, cameras, camera_of, options.min_depth_ratio)
+        by_intrinsics = projection.unproject_jacobian(model, through.params, sample_px)
+        # (T, 3, P), (T, n, 3, P), (T, P).
+        self.rays = through.rays.mT.to(dtype).contiguous()
+        self.rays_by_intrinsics = by_intrinsics.permute(0, 3, 2, 1).to(dtype).contiguous()
+        self.min_s = through.min_s.to(dtype)
+        self._table_of = through.of_frame
         # (C, 2, 1) and (C, 1, 1).
         self.focal = cameras[:, :2, None].to(dtype)
         self.centre = cameras[:, 2:4, None].to(dtype)
         self.alpha = cameras[:, 4:, None].to(dtype) if model == "mei" else None
+
+    def tables(self, chunk: Chunk) -> Tensor | int:
+        """Which tables of rays the sources (F,) of a chunk have; 0 where there is one only."""
+        return 0 if len(self.rays) == 1 else self._table_of[chunk.frames]
 
 
 class TorchSolver:
@@ -164,7 +167,9 @@ class TorchSolver:
         self.intrinsics_free = (0 in plan.free_intrinsics, 1 in plan.free_intrinsics)
         self.anything_free = plan.num_columns > 0 or plan.any_depth_free
         self._sample_px = problem.grid.sample_px(device=self.device)
-        median = state.inverse_depth.median()
+        grid = problem.grid
+        self._real = grid.real(self.device) if isinstance(grid, Points) else None
+        median = median_inverse_depth(grid, state.inverse_depth)
         self._depth_range = (options.min_inverse_depth * median, options.max_inverse_depth * median)
         cells = len(problem.edges.source) * problem.grid.num_cells
         keep_bytes = _CPU_KEEP_BYTES if self.device.type == "cpu" else _GPU_KEEP_BYTES
@@ -187,7 +192,7 @@ class TorchSolver:
 
     def _geometry(self, state: State) -> _Geometry:
         cameras = state.intrinsics.reshape(self._num_cameras, -1)
-        return _Geometry(self.problem, self.options, state, self._sample_px, cameras)
+        return _Geometry(self.problem, self.options, state, self._sample_px, cameras, self._camera_of)
 
     def _cameras(self, chunk: Chunk) -> tuple[Tensor | int, Tensor | int]:
         """Which cameras the sources (F,) and the targets (F, D) of a chunk have; 0 where there is one only."""
@@ -197,9 +202,10 @@ class TorchSolver:
 
     def _view(self, chunk: Chunk, measured: _Measured, state: State, geometry: _Geometry) -> _View:
         rotation, translation = geometry.rotation[chunk.edges], geometry.translation[chunk.edges]
-        at_source, at_target = self._cameras(chunk)
-        rays, least = geometry.rays[at_source], geometry.min_s[at_source]
-        if self._num_cameras > 1:
+        _, at_target = self._cameras(chunk)
+        tables = geometry.tables(chunk)
+        rays, least = geometry.rays[tables], geometry.min_s[tables]
+        if rays.ndim == 3:
             rays, least = rays[:, None], least[:, None]
         points = rotation @ rays
         points.addcmul_(translation, state.inverse_depth[chunk.frames][:, None, None])
@@ -275,7 +281,7 @@ class TorchSolver:
             (F, D, 6 + n + 1, 2, P), with n more after the first 6, the target's, where every view has intrinsics of its
             own; and (F, D, 3, 2, P).
         """
-        at_source, at_target = self._cameras(chunk)
+        _, at_target = self._cameras(chunk)
         scale = measured.root_weight * view.valid[:, :, None]
         residual = view.weighted
         slope = robust.root_slope(self.options.robust, scale_px, view.squared, self.options.robust_scale_px)
@@ -310,8 +316,8 @@ class TorchSolver:
             torch.mul(by_point[:, :, b], view.points[:, :, a, None], out=row)
             row.addcmul_(by_point[:, :, a], view.points[:, :, b, None], value=-1)
         for index, intrinsic in enumerate(self.plan.free_intrinsics):
-            by_intrinsic = geometry.rays_by_intrinsics[at_source, intrinsic]
-            ray = view.rotation @ (by_intrinsic[:, None] if apart else by_intrinsic)
+            by_intrinsic = geometry.rays_by_intrinsics[geometry.tables(chunk), intrinsic]
+            ray = view.rotation @ (by_intrinsic[:, None] if by_intrinsic.ndim == 3 else by_intrinsic)
             # Both camera derivatives are multiples of xy f: s outer = -scale f xy.
             share = view.s if intrinsic == 0 or view.norm is None else -view.norm
             if apart:
@@ -475,8 +481,11 @@ class TorchSolver:
         inverse_depth = state.inverse_depth.clone()
         for chunk in self.plan.chunks:
             if chunk.depth_free:
-                moved = state.inverse_depth[chunk.frames] + step.inverse_depth[chunk.frames]
-                inverse_depth[chunk.frames] = moved.clamp(*self._depth_range)
+                before = state.inverse_depth[chunk.frames]
+                moved = (before + step.inverse_depth[chunk.frames]).clamp(*self._depth_range)
+                if self._real is not None:
+                    moved = torch.where(self._real[chunk.frames], moved, before)
+                inverse_depth[chunk.frames] = moved
         cam_from_world, cam_from_rig = moved_poses(self.problem, state, step)
         return State(cam_from_world, inverse_depth, intrinsics, cam_from_rig)
 

@@ -1,7 +1,7 @@
 """Rays and pixels of every camera model, with the derivatives that bundle adjustment needs (torch, any dtype, batched).
 
 Parameters are `Camera.index_params` (integer pixel indices): `pinhole` (fx, fy, cx, cy), `mei` (fx, fy, cx, cy, alpha),
-`equirect` (width, height).
+`equirect` (width, height). Where they are (K,), a parameter may also be a tensor that broadcasts with what is asked.
 
 Unified model (Mei & Rives 2007; k or xi elsewhere, alpha here). A point X projects through
 
@@ -41,6 +41,11 @@ def _require_derivable(model: CameraModel) -> None:
         raise ConfigError(f"pictures of a camera {model!r} must be resampled before they are adjusted")
 
 
+def _normalised(params: Tensor, px: Tensor) -> tuple[Tensor, Tensor]:
+    u, v = px.unbind(-1)
+    return (u - params[2]) / params[0], (v - params[3]) / params[1]
+
+
 def unproject(model: CameraModel, params: Tensor, px: Tensor) -> Tensor:
     """Rays through pixels.
 
@@ -53,13 +58,12 @@ def unproject(model: CameraModel, params: Tensor, px: Tensor) -> Tensor:
         (..., 3) rays in the camera frame: z = 1 for `pinhole`, unit length otherwise.
     """
     _require_derivable(model)
-    u, v = px.unbind(-1)
     if model == "equirect":
+        u, v = px.unbind(-1)
         theta = ((u + 0.5) / params[0] - 0.5) * (2 * math.pi)
         phi = (v + 0.5) / params[1] * math.pi
         return torch.stack((phi.sin() * theta.sin(), -phi.cos(), phi.sin() * theta.cos()), dim=-1)
-    mx = (u - params[2]) / params[0]
-    my = (v - params[3]) / params[1]
+    mx, my = _normalised(params, px)
     if model == "pinhole":
         return torch.stack((mx, my, torch.ones_like(mx)), dim=-1)
     alpha = params[4]
@@ -72,25 +76,25 @@ def on_image_disk(model: CameraModel, params: Tensor, px: Tensor) -> Tensor:
     """(...) bool: whether a ray exists. Only a unified camera with alpha > 1 has pixels that see nothing."""
     if model != "mei":
         return torch.ones_like(px[..., 0], dtype=torch.bool)
-    m = (px - params[2:4]) / params[:2]
-    return 1 + (1 - params[4] ** 2) * (m * m).sum(-1) > _MIN_DISK
+    mx, my = _normalised(params, px)
+    return 1 + (1 - params[4] ** 2) * (mx * mx + my * my) > _MIN_DISK
 
 
 def unproject_jacobian(model: CameraModel, params: Tensor, px: Tensor) -> Tensor:
     """(..., 3, n) derivative of `unproject` with respect to the n free intrinsics: log f, and alpha for `mei`."""
     if model == "equirect":
         return px.new_zeros(*px.shape[:-1], 3, 0)
-    m = (px - params[2:4]) / params[:2]
+    mx, my = _normalised(params, px)
     if model == "pinhole":
-        return torch.stack((-m[..., 0], -m[..., 1], torch.zeros_like(m[..., 0])), dim=-1)[..., None]
+        return torch.stack((-mx, -my, torch.zeros_like(mx)), dim=-1)[..., None]
     alpha = params[4]
-    r2 = (m * m).sum(-1)
+    r2 = mx * mx + my * my
     g = (1 + (1 - alpha * alpha) * r2).clamp_min(_MIN_DISK).sqrt()
     eta = (alpha + g) / (1 + r2)
     eta_logf = (2 * r2 * eta - (1 - alpha * alpha) * r2 / g) / (1 + r2)
     eta_alpha = (1 - alpha * r2 / g) / (1 + r2)
-    by_logf = torch.cat(((eta_logf - eta)[..., None] * m, eta_logf[..., None]), dim=-1)
-    by_alpha = torch.cat((eta_alpha[..., None] * m, eta_alpha[..., None] - 1), dim=-1)
+    by_logf = torch.stack(((eta_logf - eta) * mx, (eta_logf - eta) * my, eta_logf), dim=-1)
+    by_alpha = torch.stack((eta_alpha * mx, eta_alpha * my, eta_alpha - 1), dim=-1)
     return torch.stack((by_logf, by_alpha), dim=-1)
 
 

@@ -490,6 +490,7 @@ class Adjuster:
 def _thinned(problem: Problem, state: State) -> tuple[Problem, State]:
     """The same with every other cell of every other row."""
     grid = problem.grid
+    assert isinstance(grid, Grid)
     kept = torch.arange(grid.num_cells, device=state.inverse_depth.device).reshape(grid.height, grid.width)[::2, ::2]
     cells = kept.reshape(-1)
     edges, priors = problem.edges, problem.priors

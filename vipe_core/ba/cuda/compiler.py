@@ -43,14 +43,15 @@ TILE_KERNELS = ("tile", "tile_large")
 
 @dataclass(frozen=True, slots=True)
 class Specialisation:
-    """What the pass over the cells is compiled for: camera, free intrinsics, the kernel of the residuals, and whether
-    several cameras have these intrinsics each for itself."""
+    """What the pass over the cells is compiled for: camera, free intrinsics, the kernel of the residuals, whether
+    several cameras have these intrinsics each for itself, and whether frames have points of their own, not a grid."""
 
     unified: bool
     focal: bool
     alpha: bool
     robust: RobustKernel
     apart: bool = False
+    points: bool = False
 
     @property
     def resident_blocks(self) -> dict[str, int]:
@@ -58,11 +59,11 @@ class Specialisation:
         per thread."""
         if self.apart:
             return dict.fromkeys(TILE_KERNELS, 2 if self.focal and self.alpha else 3)
-        return dict(zip(TILE_KERNELS, (3 if self.alpha else 4, 3), strict=True))
+        return dict(zip(TILE_KERNELS, (3 if self.alpha or self.points else 4, 3), strict=True))
 
     def definition(self, suffix: str = "") -> str:
         """The two kernels of this specialisation; their names end in `suffix`."""
-        flags = ", ".join(str(flag).lower() for flag in (self.unified, self.focal, self.alpha, self.apart))
+        flags = ", ".join(str(flag).lower() for flag in (self.unified, self.focal, self.alpha, self.apart, self.points))
         kernels = zip(self.resident_blocks.items(), ("false", "true"), strict=True)
         return "".join(
             f"DEFINE_TILE_KERNEL({name}{suffix}, {flags}, {CODE[self.robust]}, {large}, {blocks})\n"
@@ -75,7 +76,8 @@ def specialisations() -> Iterable[Specialisation]:
     for robust in CODE:
         for unified, focal, alpha in ((0, 0, 0), (0, 1, 0), (1, 0, 0), (1, 1, 0), (1, 0, 1), (1, 1, 1)):
             for apart in (False, True) if focal or alpha else (False,):
-                yield Specialisation(bool(unified), bool(focal), bool(alpha), robust, apart)
+                for points in (False, True):
+                    yield Specialisation(bool(unified), bool(focal), bool(alpha), robust, apart, points)
 
 
 def _read(names: Iterable[str]) -> str:

@@ -27,9 +27,9 @@ _SETTINGS = (
     "min_depth max_depth log_focal_information"
 )
 _ADDRESSES = (
-    "target_px weight prior_value prior_weight finite median largest prior_log_focal prior_view prior_sigma "
+    "points target_px weight prior_value prior_weight finite median largest prior_log_focal prior_view prior_sigma "
     "pose depth intrinsics view "
-    "frame_node frame_view frame_camera view_node node_view "
+    "frame_cells frame_node frame_view frame_camera view_node node_view "
     "edge_id edge_source edge_target edge_transform edge_adjoint edge_twist pose_step "
     "unit_frame unit_first unit_count unit_free unit_partial unit_direct unit_eliminated "
     "partial scratch pool pool_row pool_column unit_sums "

@@ -33,7 +33,8 @@ from vipe_core.ba.cuda.context import (
 )
 from vipe_core.ba.cuda.launcher import Launch, Launcher
 from vipe_core.ba.cuda.layout import LARGE_SHARED_BYTES, Layout, Tail, Unknowns, build_layout
-from vipe_core.ba.problem import Options, Problem, State
+from vipe_core.ba.problem import Grid, Options, Points, Problem, State
+from vipe_core.ba.reprojection import median_inverse_depth
 from vipe_core.ba.rigs import unknowns_of
 from vipe_core.ba.robust import CODE
 from vipe_core.ba.rules import MIN_DAMPING, SIGMA_DAMPINGS
@@ -43,7 +44,8 @@ def specialisation(problem: Problem, state: State, options: Options) -> Speciali
     """The kernels that a problem needs."""
     unified, free = problem.camera_model == "mei", problem.free
     focal, alpha = free.focal, unified and free.distortion
-    return Specialisation(unified, focal, alpha, options.robust, (focal or alpha) and num_cameras(state) > 1)
+    apart, points = (focal or alpha) and num_cameras(state) > 1, isinstance(problem.grid, Points)
+    return Specialisation(unified, focal, alpha, options.robust, apart, points)
 
 
 class Adjustment:
@@ -96,6 +98,8 @@ class Adjustment:
         frames, cells = self._state.inverse_depth.shape
         count, single, double = len(edges.source), torch.float32, torch.float64
         tensors = self._tensors
+        if isinstance(self._problem.grid, Points):
+            tensors["points"] = self._input(self._problem.grid.px)
         tensors["target_px"] = self._input(edges.target_px)
         tensors["weight"] = self._input(edges.weight)
         if self._has_prior and priors.inverse_depth is not None and priors.inverse_depth_weight is not None:
@@ -145,7 +149,9 @@ class Adjustment:
         """All tables in one copy."""
         log_focal = self._problem.priors.log_focal
         of_cameras = np.broadcast_to(0.0 if log_focal is None else np.asarray(log_focal, float), self._num_cameras)
-        tables = layout.tables | {"prior_log_focal": of_cameras}
+        grid, frames = self._problem.grid, len(self._state.inverse_depth)
+        cells = np.broadcast_to(grid.num_cells if isinstance(grid, Grid) else grid.count.cpu().numpy(), frames)
+        tables = layout.tables | {"prior_log_focal": of_cameras, "frame_cells": cells.astype(np.int32)}
         offsets, size = {}, 0
         for name, table in tables.items():
             offsets[name] = size
@@ -161,6 +167,7 @@ class Adjustment:
     def _fill_context(self, layout: Layout) -> Context:
         problem, options, priors = self._problem, self._options, self._problem.priors
         frames, cells = self._state.inverse_depth.shape
+        grid = problem.grid if isinstance(problem.grid, Grid) else None
         focal_free, alpha_free = self._intrinsics_free
         any_depth = bool(layout.tables["unit_free"].any())
         information = 1 / priors.log_focal_sigma**2 if priors.log_focal is not None and focal_free else 0.0
@@ -168,7 +175,7 @@ class Adjustment:
             num_frames=frames,
             num_edges=len(problem.edges.source),
             num_cells=cells,
-            width=problem.grid.width,
+            width=cells if grid is None else grid.width,
             num_units=layout.num_units,
             num_slices=self._slices,
             num_nodes=layout.num_nodes,
@@ -190,8 +197,8 @@ class Adjustment:
             views_free=self._views_free,
             has_view_prior=self._has_view_prior,
             num_pool=layout.pool_size,
-            stride=problem.grid.stride,
-            offset=problem.grid.offset,
+            stride=0.0 if grid is None else grid.stride,
+            offset=0.0 if grid is None else grid.offset,
             robust_scale=options.robust_scale_px,
             first_scale=options.initial_scale_px or 0.0,
             tolerance=options.relative_tolerance,
@@ -255,8 +262,10 @@ class Adjustment:
         tensors["intrinsics"][..., : state.intrinsics.shape[-1]].copy_(state.intrinsics)
         if state.cam_from_rig is not None and self._num_views:
             tensors["view"].copy_(state.cam_from_rig.flatten(1))
-        tensors["median"].copy_(state.inverse_depth.median())
+        tensors["median"].copy_(median_inverse_depth(self._problem.grid, state.inverse_depth))
         checks = [tensors[name].isfinite().all() for name in ("pose", "depth", "intrinsics", "view")]
+        if "points" in tensors:
+            checks.append(tensors["points"].isfinite().all())
         if self._has_prior and priors.inverse_depth is not None and priors.inverse_depth_weight is not None:
             weight = tensors["prior_weight"]
             checks.append(weight.isfinite().all())

@@ -61,6 +61,7 @@ struct Context {
     double min_depth, max_depth, log_focal_information;
 
     // The problem. Pixels and weights are (E, P, 2), in the order that they came in.
+    const float* points;  // (N, P, 2) pixels of a frame's own instead of those of a grid, or none
     const float* target_px;
     const float* weight;
     const float* prior_value;   // (N, P)
@@ -80,6 +81,7 @@ struct Context {
     double* view;
 
     // Edges in order of (source, target).
+    const int* frame_cells;   // (N) cells, at most P
     const int* frame_node;    // (N) node of a free pose, or -1
     const int* frame_view;    // (N) view of a rig, or 0
     const int* frame_camera;  // (N) whose intrinsics it has

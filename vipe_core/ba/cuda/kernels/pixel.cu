@@ -23,12 +23,19 @@ struct Rays {
 #define MAX_RAY_ROWS 10
 
 // Fill the rays of a tile of a frame with intrinsics k; thread p < TILE does cell p.
-template <bool UNIFIED, bool FOCAL, bool ALPHA>
-__device__ inline void fill_rays(const Context& c, const double* k, i64 cell, int p, float* rays) {
+template <bool UNIFIED, bool FOCAL, bool ALPHA, bool POINTS>
+__device__ inline void fill_rays(const Context& c, const double* k, int frame, i64 cell, int p, float* rays) {
     using R = Rays<UNIFIED, FOCAL, ALPHA>;
-    const int width = (int)c.width;
-    float mx = ((float)((int)cell % width) * (float)c.stride + (float)(c.offset - k[2])) / (float)k[0];
-    float my = ((float)((int)cell / width) * (float)c.stride + (float)(c.offset - k[3])) / (float)k[1];
+    float mx, my;
+    if constexpr (POINTS) {
+        const float2 px = ((const float2*)c.points)[frame * c.num_cells + cell];
+        mx = (float)(px.x - k[2]) / (float)k[0];
+        my = (float)(px.y - k[3]) / (float)k[1];
+    } else {
+        const int width = (int)c.width;
+        mx = ((float)((int)cell % width) * (float)c.stride + (float)(c.offset - k[2])) / (float)k[0];
+        my = ((float)((int)cell / width) * (float)c.stride + (float)(c.offset - k[3])) / (float)k[1];
+    }
     if constexpr (!UNIFIED) {
         rays[p] = mx;
         rays[TILE + p] = my;

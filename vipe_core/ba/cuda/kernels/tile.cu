@@ -79,7 +79,7 @@ __device__ inline void multiply(const float* rows, const TileLayout& at, int ite
 
 // LARGE units keep rows and products in `scratch`: slower, with the same bits. Where cameras are APART, an edge has rows
 // for the intrinsics of its target's camera, then of its source's; with the depths, those of the same camera are summed.
-template <bool UNIFIED, bool FOCAL, bool ALPHA, bool APART, int ROBUST, bool LARGE>
+template <bool UNIFIED, bool FOCAL, bool ALPHA, bool APART, bool POINTS, int ROBUST, bool LARGE>
 __device__ inline void tile_pass(const Context& c, int first_unit, float* shared) {
     constexpr int INTRINSICS = FOCAL + ALPHA, TWIST = 6, SOURCE = TWIST + (APART ? INTRINSICS : 0);
     constexpr int RIGHT = SOURCE + INTRINSICS;
@@ -94,6 +94,7 @@ __device__ inline void tile_pass(const Context& c, int first_unit, float* shared
     const i64 slice = blockIdx.x % c.num_slices;
     const int frame = c.unit_frame[unit], first = c.unit_first[unit], count = c.unit_count[unit];
     const int depth_free = c.unit_free[unit];
+    const i64 cells = POINTS ? c.frame_cells[frame] : P;
     const int tail_nodes = APART ? (int)c.num_tail : 1, unknowns = APART ? (int)c.num_intrinsics : INTRINSICS;
     const TileLayout at(count, depth_free, tail_nodes);
 
@@ -122,21 +123,22 @@ __device__ inline void tile_pass(const Context& c, int first_unit, float* shared
     const float grown = 1.0f + (float)control.damping;
     float prior_cost = 0.0f;
 
-    const i64 end = (slice + 1) * SLICE < P ? (slice + 1) * SLICE : P;
+    const i64 end = (slice + 1) * SLICE < cells ? (slice + 1) * SLICE : cells;
     for (i64 start = slice * SLICE; start < end; start += TILE) {
         const i64 cell = start + thread;  // of the thread that keeps a cell's sums
-        const bool keeper = thread < TILE, real = keeper && cell < P;
+        const bool keeper = thread < TILE, real = keeper && cell < cells;
         float prior_value = 0.0f, prior_weight = 0.0f, depth = 0.0f;
         __syncthreads();  // nobody reads the previous tile any more
         if (keeper) {
-            const i64 near = cell < P ? cell : P - 1;
+            const i64 near = cell < cells ? cell : cells - 1;
             depth = c.depth[(now * c.num_frames + frame) * P + near];
             depths[thread] = depth;
             if (depth_free && c.has_prior && real) {
                 prior_weight = c.prior_weight[(i64)frame * P + cell];
                 prior_value = prior_weight > 0.0f ? c.prior_value[(i64)frame * P + cell] : depth;
             }
-            fill_rays<UNIFIED, FOCAL, ALPHA>(c, cameras + (step && depth_free ? 0 : 5), near, thread, rays);
+            fill_rays<UNIFIED, FOCAL, ALPHA, POINTS>(c, cameras + (step && depth_free ? 0 : 5), frame, near, thread,
+                                                     rays);
         }
         __syncthreads();
 
@@ -150,8 +152,8 @@ __device__ inline void tile_pass(const Context& c, int first_unit, float* shared
 #pragma unroll
                 for (int h = 0; h < 2; ++h) {
                     const int p = lane + 32 * h;
-                    const bool inside = start + p < P;
-                    const i64 at_cell = row + (inside ? start + p : P - 1);
+                    const bool inside = start + p < cells;
+                    const i64 at_cell = row + (inside ? start + p : cells - 1);
                     View view = see<UNIFIED, FOCAL, ALPHA>(before, transform, rays, p, depths[p],
                                                            ((const float2*)c.target_px)[at_cell],
                                                            ((const float2*)c.weight)[at_cell], inside);
@@ -205,7 +207,8 @@ __device__ inline void tile_pass(const Context& c, int first_unit, float* shared
                 depth = depth < low ? low : depth > high ? high : depth;
                 depths[thread] = depth;
                 if (real) c.depth[(next * c.num_frames + frame) * P + cell] = depth;
-                fill_rays<UNIFIED, FOCAL, ALPHA>(c, cameras + 5, real ? cell : P - 1, thread, rays);
+                const i64 near = real ? cell : cells - 1;
+                fill_rays<UNIFIED, FOCAL, ALPHA, POINTS>(c, cameras + 5, frame, near, thread, rays);
             }
             __syncthreads();
         }
@@ -229,8 +232,8 @@ __device__ inline void tile_pass(const Context& c, int first_unit, float* shared
 #pragma unroll
             for (int h = 0; h < 2; ++h) {
                 const int p = lane + 32 * h;
-                const bool inside = start + p < P;
-                const i64 at_cell = row + (inside ? start + p : P - 1);
+                const bool inside = start + p < cells;
+                const i64 at_cell = row + (inside ? start + p : cells - 1);
                 View view = see<UNIFIED, FOCAL, ALPHA>(camera, transform, rays, p, depths[p],
                                                        ((const float2*)c.target_px)[at_cell],
                                                        ((const float2*)c.weight)[at_cell], inside);
@@ -374,9 +377,9 @@ __device__ inline void tile_pass(const Context& c, int first_unit, float* shared
     if (lane == 0 && warp < TILE / 32) out[warp] = prior_cost;
 }
 
-#define DEFINE_TILE_KERNEL(NAME, UNIFIED, FOCAL, ALPHA, APART, ROBUST, LARGE, BLOCKS)                       \
+#define DEFINE_TILE_KERNEL(NAME, UNIFIED, FOCAL, ALPHA, APART, POINTS, ROBUST, LARGE, BLOCKS)               \
     extern "C" __global__ void __launch_bounds__(TILE_THREADS, BLOCKS)                                      \
         NAME(const Context context, int first_unit) {                                                       \
         DYNAMIC_SHARED(shared);                                                                             \
-        tile_pass<UNIFIED, FOCAL, ALPHA, APART, ROBUST, LARGE>(context, first_unit, shared);                \
+        tile_pass<UNIFIED, FOCAL, ALPHA, APART, POINTS, ROBUST, LARGE>(context, first_unit, shared);        \
     }
