@@ -28,8 +28,8 @@ _UNWELCOME = re.compile(
     r"\bA?GPL|(?<!Lesser )General Public|SSPL|Commons Clause|Proprietary|Non-?Commercial", re.IGNORECASE
 )
 
-# What the CUDA build of torch brings along: NVIDIA's own terms, on machines with its GPUs only.
-_CUDA = ("nvidia-", "cuda-")
+# What the CUDA build of torch brings along, on machines with GPUs only: the page is the same for both builds.
+_CUDA = ("nvidia-", "cuda-", "triton")
 
 # Native libraries under the GPL that a wheel brings along, and what that means.
 GPL_LIBRARIES = {
@@ -106,7 +106,8 @@ def page(packages: list[Package]) -> str:
         "",
         "Native libraries: the FFmpeg inside of `av` states LGPL 3 or later and the one inside of",
         "`opencv-python-headless` LGPL 2.1 or later; both are loaded dynamically and can be replaced. The CUDA build",
-        "of `torch` brings NVIDIA's libraries along (`nvidia-*`, `cuda-*`), which are under NVIDIA's own terms.",
+        "of `torch` brings NVIDIA's libraries along (`nvidia-*`, `cuda-*`), which are under NVIDIA's own terms, and",
+        "`triton` (MIT).",
     ]
     for package in packages:
         for library in package.gpl_libraries:
