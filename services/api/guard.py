@@ -85,7 +85,7 @@ class Guard:
             self._count(address)
         try:
             if not key:
-                raise Unauthorized("send an API key as `Authorization: Bearer <key>`")
+                raise Unauthorized("send an API key in the header `Authorization`, after the word `Bearer`")
             return await run_sync(self._authenticator.verify, key)
         except Unauthorized as error:
             if key:

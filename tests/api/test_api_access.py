@@ -186,8 +186,9 @@ class TestKeys:
         with world.http(None) as http:
             headers = {} if wrong is None else {"Authorization": wrong.encode("latin-1")}
             answer = http.get("/v1/jobs", headers=headers)  # type: ignore[arg-type]
-            assert_problem(answer, 401, "unauthorized")
+            detail = assert_problem(answer, 401, "unauthorized")["detail"]
             assert answer.headers["www-authenticate"] == "Bearer"
+            assert "***" not in detail, "advice is not taken for a secret"
 
     def test_a_stranger_learns_nothing_from_bodies_paths_and_methods(self, world: World) -> None:
         with world.http(None) as http:
