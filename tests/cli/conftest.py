@@ -10,18 +10,13 @@ import pytest
 from cli_helpers import VIPECTL, Run
 
 from vipe_core.evaluation.synthetic import tiny_clip
-from vipe_core.video.encode import VideoWriter
 
 
 @pytest.fixture(scope="session")
 def clip(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A small video of a camera that moves sideways: 12 frames of 128x96."""
     rendered = tiny_clip("sideways", num_frames=12, width=128, height=96)
-    path = tmp_path_factory.mktemp("clip") / "sideways.mp4"
-    with VideoWriter(path, rendered.fps) as writer:
-        for rgb in rendered.rgb:
-            writer.write(rgb)
-    return path
+    return rendered.write_video(tmp_path_factory.mktemp("clip") / "sideways.mp4")
 
 
 @pytest.fixture

@@ -11,7 +11,6 @@ from pathlib import Path
 import pytest
 
 from vipe_core.evaluation.synthetic import tiny_clip
-from vipe_core.video.encode import VideoWriter
 
 _REPOSITORY = Path(__file__).resolve().parents[2]
 _ANNOTATE = """
@@ -31,16 +30,10 @@ write_artifacts(annotator.annotate(video), out)
 def clips(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     """An orbit with things that move in it, long enough for keyframes, infill and motion masks; and another clip."""
     folder = tmp_path_factory.mktemp("clips")
-    paths = {}
-    for name, clip in (
-        ("orbit", tiny_clip("dynamic", 12, 160, 120, noise=1.0)),
-        ("other", tiny_clip("forward", 3, 128, 96, noise=1.0)),
-    ):
-        paths[name] = folder / f"{name}.mp4"
-        with VideoWriter(paths[name], clip.fps) as writer:
-            for rgb in clip.rgb:
-                writer.write(rgb)
-    return paths
+    return {
+        "orbit": tiny_clip("dynamic", 12, 160, 120, noise=1.0).write_video(folder / "orbit.mp4"),
+        "other": tiny_clip("forward", 3, 128, 96, noise=1.0).write_video(folder / "other.mp4"),
+    }
 
 
 def payload(folder: Path, video: Path, *before: Path, hash_seed: str, cores: set[int] | None = None) -> dict[str, str]:

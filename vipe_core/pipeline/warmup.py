@@ -8,7 +8,6 @@ from vipe_core.annotation import Annotation
 from vipe_core.cameras import CameraModel
 from vipe_core.evaluation.synthetic import tiny_clip
 from vipe_core.pipeline.annotator import Annotator
-from vipe_core.video.encode import VideoWriter
 
 _FRAMES = 14
 # Panoramas are twice as wide as high, and each face of their cube needs pixels enough to be matched.
@@ -27,8 +26,4 @@ def warm_up(annotator: Annotator, folder: Path) -> Annotation:
     """
     model = _SEEN_BY[annotator.preset.camera]
     clip = tiny_clip("dynamic", _FRAMES, *_SIZES[model], model=model, noise=1.0)
-    video = folder / "clip.mp4"
-    with VideoWriter(video, clip.fps) as writer:
-        for rgb in clip.rgb:
-            writer.write(rgb)
-    return annotator.annotate(video)
+    return annotator.annotate(clip.write_video(folder / "clip.mp4"))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
@@ -16,6 +17,7 @@ from vipe_core.evaluation.synthetic.paths import arc, handheld, look_at, through
 from vipe_core.evaluation.synthetic.render import render_frames
 from vipe_core.evaluation.synthetic.scene import Scene
 from vipe_core.evaluation.synthetic.scenes import moving_ball_scene, room_scene
+from vipe_core.video.encode import VideoWriter
 
 ClipKind = Literal["static", "pure_rotation", "forward", "sideways", "orbit", "dynamic"]
 CLIP_KINDS: tuple[ClipKind, ...] = ("static", "pure_rotation", "forward", "sideways", "orbit", "dynamic")
@@ -42,6 +44,13 @@ class SyntheticClip:
     @property
     def depth_kind(self) -> DepthKind:
         return depth_kind_of(self.camera)
+
+    def write_video(self, path: Path) -> Path:
+        """Its pictures as a video file."""
+        with VideoWriter(path, self.fps) as writer:
+            for rgb in self.rgb:
+                writer.write(rgb)
+        return path
 
 
 def render_clip(
