@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 
 import exact_room
 import numpy as np
@@ -19,8 +19,10 @@ from vipe_core.priors.protocols import (
     Match,
     MetricDepth,
     MetricEstimate,
+    PointFollower,
     PriorFamily,
     Refined,
+    TrackedPoints,
     WorkingFrame,
 )
 from vipe_core.slam.reprojection import Reprojector
@@ -104,8 +106,15 @@ class RoomRefiner:
 
     # -- the initial camera ----------------------------------------------------------------------------------------
 
-    def priors(self, fov_deg: float, sigma: float, metric: MetricDepth | None = None) -> PriorFamily:
-        return PriorFamily(self, None, None, _Guess(fov_deg, sigma), refiner=self, metric=metric)
+    def priors(
+        self,
+        fov_deg: float,
+        sigma: float,
+        metric: MetricDepth | None = None,
+        follower: PointFollower | None = None,
+    ) -> PriorFamily:
+        guess = _Guess(fov_deg, sigma)
+        return PriorFamily(self, None, None, guess, refiner=self, metric=metric, follower=follower)
 
     # -- the frame source ------------------------------------------------------------------------------------------
 
@@ -144,6 +153,48 @@ class RoomDepth:
         assert inverse_depth.shape == shape
         depth_m = self._unit * camera.focal_px / self._refiner.camera.focal_px / inverse_depth
         return MetricEstimate(depth_m.astype(np.float32), np.ones(shape, np.float32))
+
+
+class RoomFollower:
+    """`PointFollower` that sees points of the exact room where they are, in pictures of twice the size.
+
+    Attributes:
+        followed: Frames that it was given, a list for each run.
+    """
+
+    def __init__(self, refiner: RoomRefiner, wrong_px: float = 0.0) -> None:
+        self._refiner, self._wrong_px = refiner, wrong_px
+        self.followed: list[list[int]] = []
+        # Points of the surfaces that every fifth frame sees.
+        rng = np.random.default_rng(0)
+        camera, points = refiner.camera, []
+        for pose in refiner.world_from_cam[::5]:
+            depth = exact_room.depth_and_colour(camera, pose, "z")[0]
+            x, y = rng.integers(0, WIDTH, 150), rng.integers(0, HEIGHT, 150)
+            fx, fy, cx, cy = camera.index_params()
+            z = depth[y, x]
+            points.append(np.stack(((x - cx) / fx * z, (y - cy) / fy * z, z), axis=1) @ pose[:3, :3].T + pose[:3, 3])
+        self._points = np.concatenate(points)
+
+    def input_size(self, width: int, height: int) -> tuple[int, int]:
+        return 2 * width, 2 * height
+
+    def follow(self, frames: Iterable[Frame], camera: Camera) -> Iterator[TrackedPoints]:
+        assert (camera.width, camera.height) == (2 * WIDTH, 2 * HEIGHT)
+        self.followed.append([])
+        own = self._refiner.camera
+        fx, fy, cx, cy = own.index_params()
+        for frame in frames:
+            self.followed[-1].append(frame.index)
+            pose = self._refiner.world_from_cam[frame.index]
+            x, y, z = ((self._points - pose[:3, 3]) @ pose[:3, :3]).T
+            px = np.stack((x / z * fx + cx, y / z * fy + cy), axis=1)
+            inside = ((px >= 0) & (px <= (WIDTH - 1, HEIGHT - 1))).all(axis=1) & (z > 0)
+            depth = exact_room.depth_and_colour(own, pose, "z")[0]
+            column, row = np.rint(np.where(inside[:, None], px, 0)).astype(int).T
+            ids = np.flatnonzero(inside & (np.abs(depth[row, column] - z) < 0.02 * z))
+            slipped = self._wrong_px * np.array([[frame.index, 0]])
+            yield TrackedPoints(ids, (2 * (px[ids] + slipped + 0.5) - 0.5).astype(np.float32))
 
 
 class _Refinement:

@@ -172,6 +172,33 @@ class SparseTracker(Protocol):
         """Measurements at the cells that hold a track; weight 0 elsewhere. `dense` guides the search."""
 
 
+@dataclass(frozen=True, slots=True)
+class TrackedPoints:
+    """Points of a frame that were followed to it, or begin there.
+
+    Attributes:
+        ids: (n,) int64: a point keeps its own for as long as it is followed, and nobody has it afterwards.
+        px: (n, 2) float32 where they are.
+    """
+
+    ids: NDArray[np.int64]
+    px: NDArray[np.float32]
+
+
+class PointFollower(Protocol):
+    """Follows points through the frames of a shot, in order (paper section 3.2.2). Stateless between calls."""
+
+    def input_size(self, width: int, height: int) -> tuple[int, int]:
+        """(width, height) at which a video of that size is best given."""
+
+    def follow(self, frames: Iterable[Frame], camera: Camera) -> Iterator[TrackedPoints]:
+        """The points of every frame, in order; none on pixels that a frame says must not be used.
+
+        Args:
+            camera: As far as it is known, at the size of the frames.
+        """
+
+
 class Aligner(Protocol):
     """Measurements of the last digit, once the geometry is known to a few pixels (paper: the recurrent update)."""
 
@@ -258,6 +285,7 @@ class PriorFamily:
         refiner: Measurements refined in turns with the geometry, which then replaces pairwise matching in the map; None
             for a family that measures each pair once.
         metric: Metric depth as a prior of the map, with a refiner; None without.
+        follower: Tracks through consecutive frames that add to what a refiner measures; None without.
     """
 
     matcher: DenseMatcher
@@ -267,6 +295,7 @@ class PriorFamily:
     aligner: Aligner | None = None
     refiner: Refiner | None = None
     metric: MetricDepth | None = None
+    follower: PointFollower | None = None
 
 
 class VideoDepth(Protocol):

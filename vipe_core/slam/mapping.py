@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Literal
@@ -14,7 +14,7 @@ import torch
 from numpy.typing import NDArray
 
 from vipe_core.cameras import CameraModel
-from vipe_core.priors.protocols import PriorFamily
+from vipe_core.priors.protocols import PriorFamily, TrackedPoints
 from vipe_core.slam.adjustment import Adjuster, FocalPrior
 from vipe_core.slam.backend import Backend
 from vipe_core.slam.bootstrap import Bootstrap
@@ -89,7 +89,11 @@ class _Bare:
 
 
 class ShotMapper:
-    """Maps shots of one video, one after the other."""
+    """Maps shots of one video, one after the other.
+
+    Args:
+        seen: Points that were followed to the keyframes, by their index in the video, working pixels; None without.
+    """
 
     def __init__(
         self,
@@ -100,6 +104,7 @@ class ShotMapper:
         camera_model: CameraModel,
         timestamps_s: NDArray[np.float64],
         clock: StageClock,
+        seen: Mapping[int, TrackedPoints] | None = None,
     ) -> None:
         self._priors = priors
         self._settings = settings
@@ -107,6 +112,7 @@ class ShotMapper:
         self._size = size
         self._times_s = timestamps_s
         self._clock = clock
+        self._seen = seen
         self._model: CameraModel = camera_model
         self.reprojector = Reprojector(camera_model, size.grid)
 
@@ -221,8 +227,10 @@ class ShotMapper:
         schedule, scale_px = settings.refinement, settings.scaled_px(1.0, self._size.width)
         metric = self._priors.metric if settings.terms.depth_prior else None
         prior = None if metric is None else DepthPrior(metric, refiner, keyframes)
-        tracker = RefinedTracker(refiner, keyframes, adjuster, reprojector, schedule, scale_px, prior)
-        backend = RefinedBackend(refiner, keyframes, graph, adjuster, reprojector, schedule, scale_px, prior)
+        tracker = RefinedTracker(refiner, keyframes, adjuster, reprojector, schedule, scale_px, prior, self._seen)
+        backend = RefinedBackend(
+            refiner, keyframes, graph, adjuster, reprojector, schedule, scale_px, prior, self._seen
+        )
         on_the_way, again, finally_ = schedule.global_updates
         with self._clock("track"):
             first = min(len(chosen), settings.min_keyframes)

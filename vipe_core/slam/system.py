@@ -22,6 +22,7 @@ from vipe_core.slam.diagnostics import LoopReport, MapReport, combine
 from vipe_core.slam.frames import EncodedFrames
 from vipe_core.slam.infill import Trajectory, fill_in
 from vipe_core.slam.mapping import Motion, ShotMap, ShotMapper
+from vipe_core.slam.recurrent.tracks import follow_keyframes
 from vipe_core.slam.selection import Report, Selection, Shot, select_keyframes
 from vipe_core.slam.settings import SlamSettings
 from vipe_core.slam.timing import StageClock
@@ -156,8 +157,13 @@ class Slam:
                 sigma = 0.0 if known.use == "fixed" else _CALIBRATED_SIGMA
                 estimate = IntrinsicsEstimate(known.camera.resized(*size.size), sigma, 0)
             report("intrinsics", 1, 1)
+        follower = self._priors.follower if settings.terms.sparse_tracks else None
+        seen = None
+        if follower is not None:
+            with clock("follow"):
+                seen = follow_keyframes(follower, source, selection, size, estimate.camera, report)
         mapper = ShotMapper(
-            self._priors, settings, self._device, size, estimate.camera.model, selection.timestamps_s, clock
+            self._priors, settings, self._device, size, estimate.camera.model, selection.timestamps_s, clock, seen
         )
         held = known is not None and known.use == "fixed"
         maps = self._map(mapper, selection, main, estimate, held, report)

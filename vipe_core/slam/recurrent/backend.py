@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import logging
 import math
+from collections.abc import Mapping
 
 from vipe_core.ba.problem import Result
-from vipe_core.priors.protocols import Refiner
+from vipe_core.priors.protocols import Refiner, TrackedPoints
 from vipe_core.slam.adjustment import Adjuster
 from vipe_core.slam.graph import Graph
 from vipe_core.slam.keyframes import KeyframeMap
@@ -38,6 +39,7 @@ class RefinedBackend:
         settings: RefinementSettings,
         scale_px: float,
         prior: DepthPrior | None = None,
+        seen: Mapping[int, TrackedPoints] | None = None,
     ) -> None:
         self._refiner = refiner
         self._keyframes = keyframes
@@ -46,6 +48,7 @@ class RefinedBackend:
         self._reprojector = reprojector
         self._settings = settings
         self._prior = prior
+        self._seen = seen
         self._max_px = scale_px * settings.global_px
         self.focal_sigma_ratio = adjuster.focal_prior.sigma
 
@@ -72,6 +75,7 @@ class RefinedBackend:
             spilled=settings.lean,
             prior=prior,
             prior_information=settings.metric_information,
+            seen=self._seen,
         )
         edges.add(found)
         settled = updates if prior is None or not settle or self._adjuster.focal_prior.held else updates // 2

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 import torch
@@ -10,11 +10,12 @@ from torch import Tensor
 
 from vipe_core.ba.problem import Edges, Free, Priors, Problem, Result, State
 from vipe_core.ba.reprojection import reproject
-from vipe_core.priors.protocols import Match, Refined, Refiner
+from vipe_core.priors.protocols import Match, Refined, Refiner, TrackedPoints
 from vipe_core.slam.adjustment import Adjuster, Step
 from vipe_core.slam.graph import Graph
 from vipe_core.slam.keyframes import KeyframeMap
 from vipe_core.slam.recurrent.depth_prior import DepthPrior
+from vipe_core.slam.recurrent.tracks import EdgeTracks
 
 Pair = tuple[int, int]
 
@@ -29,6 +30,7 @@ class RefinedEdges:
         lean, spilled: See `Refiner.begin`.
         prior: Of inverse depths; None where nothing is known of them.
         prior_information: Of it, in units of the map's median.
+        seen: Points that were followed to the frames of the video, by their index; None without tracks.
 
     Attributes:
         active: Edges that are refined, in the order of their rows.
@@ -45,11 +47,13 @@ class RefinedEdges:
         spilled: bool = False,
         prior: DepthPrior | None = None,
         prior_information: float = 0.0,
+        seen: Mapping[int, TrackedPoints] | None = None,
     ) -> None:
         self._keyframes = keyframes
         self._adjuster = adjuster
         self._prior, self._prior_information = prior, prior_information
         self._refinement = refiner.begin(keyframes.grid, lean=lean, spilled=spilled)
+        self._tracks = None if seen is None else EdgeTracks(keyframes.grid, seen, adjuster.device)
         self.active: list[Pair] = []
         self.stored: dict[Pair, tuple[Tensor, Tensor]] = {}
         self._ages: list[int] = []
@@ -68,6 +72,9 @@ class RefinedEdges:
         seen = self.seen(pairs)
         features = self._keyframes.features
         self._refinement.add([(features[i], features[j]) for i, j in pairs], seen)
+        if self._tracks is not None:
+            index = self._keyframes.frame_index
+            self._tracks.add((index[i], index[j]) for i, j in pairs)
         self.active += pairs
         self._ages += [0] * len(pairs)
         nothing = torch.zeros_like(seen)
@@ -99,6 +106,8 @@ class RefinedEdges:
         refined: Refined = self._refinement.update(self.seen(self.active), [i for i, _ in self.active])
         device = self._adjuster.device
         self._target_px, self._weight = refined.target_px.to(device), refined.weight.to(device)
+        if self._tracks is not None:
+            self._target_px, self._weight = self._tracks.joined(self._target_px, self._weight)
         for frame, damping in zip(sorted({i for i, _ in self.active}), refined.damping.to(device), strict=True):
             self._damping[frame] = damping
         self._ages = [age + 1 for age in self._ages]
@@ -219,6 +228,8 @@ class RefinedEdges:
         if len(rows) == len(self.active):
             return
         self._refinement.keep(rows)
+        if self._tracks is not None:
+            self._tracks.keep(rows)
         self.active = [self.active[row] for row in rows]
         self._ages = [self._ages[row] for row in rows]
         if self._target_px is not None and self._weight is not None:

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
 from vipe_core.geometry.arrays import interpolate_trajectory
-from vipe_core.priors.protocols import Refiner
+from vipe_core.priors.protocols import Refiner, TrackedPoints
 from vipe_core.slam.adjustment import Adjuster
 from vipe_core.slam.keyframes import KeyframeMap
 from vipe_core.slam.recurrent.depth_prior import DepthPrior
@@ -28,6 +28,7 @@ class RefinedTracker:
     Args:
         scale_px: Working pixels per pixel of an image that is 640 wide.
         prior: Of inverse depths; None where nothing is known of them.
+        seen: Points that were followed to the frames of the video; see `RefinedEdges`.
     """
 
     def __init__(
@@ -39,6 +40,7 @@ class RefinedTracker:
         settings: RefinementSettings,
         scale_px: float,
         prior: DepthPrior | None = None,
+        seen: Mapping[int, TrackedPoints] | None = None,
     ) -> None:
         self._keyframes = keyframes
         self._reprojector = reprojector
@@ -55,6 +57,7 @@ class RefinedTracker:
             lean=settings.lean,
             prior=prior,
             prior_information=settings.metric_information,
+            seen=seen,
         )
 
     def start(self, first: Sequence[Keyframe], times_s: Sequence[float]) -> None:

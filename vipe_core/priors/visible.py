@@ -1,0 +1,25 @@
+"""Which points of a picture may be used."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+def visible(
+    points_px: NDArray[Any], size: tuple[int, int], masked: NDArray[np.bool_] | None = None
+) -> NDArray[np.bool_]:
+    """(n,) whether points are in a picture, and not on what is masked in it.
+
+    Args:
+        points_px: (n, 2) index coordinates.
+        size: (height, width) of the picture.
+    """
+    height, width = size
+    inside = np.asarray(((points_px >= 0) & (points_px <= (width - 1, height - 1))).all(axis=1), np.bool_)
+    if masked is not None:
+        column, row = np.rint(np.where(inside[:, None], points_px, 0)).astype(np.int64).T
+        inside &= ~masked[row, column]
+    return inside
