@@ -170,7 +170,7 @@ def _metric(name: str, device: torch.device) -> list[Answer]:
 
 def _geocalib(name: str, device: torch.device) -> list[Answer]:
     model = {provider.partition(".")[2]: camera for camera, provider in GEOCALIB.items()}[name]
-    initial = open_priors("classical.dis_flow", f"nvidia_vipe.{name}", model, device)().intrinsics
+    initial = open_priors("classical.dis_flow", "none", f"nvidia_vipe.{name}", model, device)().intrinsics
     frames = [WorkingFrame(k, _picture(k)[..., 0], _picture(k)) for k in range(5)]
     found, seconds = _timed(device, lambda: initial.estimate(frames, Grid(_HEIGHT // 8, _WIDTH // 8)))
     if found.camera.model != model or not np.isfinite(found.camera.params).all():

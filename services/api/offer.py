@@ -39,6 +39,13 @@ def metric_depths() -> tuple[str, ...]:
     return METRIC_DEPTH
 
 
+@cache
+def tracks() -> tuple[str, ...]:
+    from vipe_core.pipeline.presets import TRACKS
+
+    return TRACKS
+
+
 def camera_of(preset: str) -> str:
     """The camera model that a preset takes where a job names none."""
     from vipe_core.pipeline.presets import resolve

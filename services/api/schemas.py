@@ -88,6 +88,12 @@ class JobRequest(ControlFields):
         max_length=64,
         description="Network that tells the scale, such as `hf.depth_pro`, or `none`. Default: the preset's own.",
     )
+    tracks: Annotated[str, AfterValidator(lambda v: offer.one_of(v, offer.tracks()))] | None = Field(
+        default=None,
+        max_length=64,
+        description="Tracks through consecutive frames that join what the DROID network measures, with its presets: "
+        "`classical.corners`, `cuvslam.odometry` (workers need PyCuVSLAM) or `none`. Default: the preset's own.",
+    )
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
@@ -115,6 +121,7 @@ class JobRequest(ControlFields):
             "phrases": None if self.phrases is None else tuple(self.phrases),
             "detection_interval_s": self.detection_interval_s,
             "metric_depth": self.metric_depth,
+            "tracks": self.tracks,
         }
 
     def _of_depth(self) -> list[str]:
@@ -156,6 +163,7 @@ class SpecView(_View):
     phrases: list[str] | None
     detection_interval_s: float | None
     metric_depth: str | None
+    tracks: str | None
     calibration: dict[str, Any] | None
 
 

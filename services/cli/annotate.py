@@ -65,6 +65,14 @@ def annotate(
         str | None,
         typer.Option(metavar="NETWORK", help="What tells the scale, such as hf.depth_pro or nvidia_vipe.unidepth."),
     ] = None,
+    tracks: Annotated[
+        str | None,
+        typer.Option(
+            metavar="FOLLOWER",
+            help="Tracks beside the DROID network: classical.corners, cuvslam.odometry (PyCuVSLAM) or none. "
+            "Default: corners with vipe, none with vipe_fast and pose_only.",
+        ),
+    ] = None,
     calibration: Annotated[
         Path | None,
         typer.Option(
@@ -116,7 +124,7 @@ def annotate(
     use_limits(read_settings().media_limits())
     console = Console(stderr=True, quiet=as_json)
     words = None if phrases is None else tuple(listed(phrases))
-    options = PresetOptions(words, detection_interval, metric_depth)
+    options = PresetOptions(words, detection_interval, metric_depth, tracks)
     if rig is not None:
         if options != PresetOptions():
             raise typer.BadParameter("a rig is annotated without networks for masks and scale", param_hint="--rig")

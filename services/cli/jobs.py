@@ -74,6 +74,10 @@ def submit(
     metric_depth: Annotated[
         str | None, typer.Option(metavar="NETWORK", help="What tells the scale, as `vipectl annotate --metric-depth`.")
     ] = None,
+    tracks: Annotated[
+        str | None,
+        typer.Option(metavar="FOLLOWER", help="Tracks beside the DROID network, as `vipectl annotate --tracks`."),
+    ] = None,
     calibration: Annotated[
         Path | None,
         typer.Option(metavar="FILE", help="The camera of every video, as `vipectl annotate --calibration`."),
@@ -117,6 +121,8 @@ def submit(
         spec["detection_interval_s"] = detection_interval
     if metric_depth is not None:
         spec["metric_depth"] = metric_depth
+    if tracks is not None:
+        spec["tracks"] = tracks
     if calibration is not None:
         spec["calibration"] = _calibration(calibration)
     if attributes is not None:

@@ -37,6 +37,7 @@ class JobSpec:
         phrases: What is found, followed and masked; None for what the preset does.
         detection_interval_s: Time between looks for new things; None for the preset's own.
         metric_depth: Network that tells the scale; None for the preset's own.
+        tracks: What follows points for the DROID network; None for the preset's own.
         calibration: The camera that took every video of the job, in the engine's JSON; None where it is estimated.
     """
 
@@ -52,6 +53,7 @@ class JobSpec:
     phrases: tuple[str, ...] | None = None
     detection_interval_s: float | None = None
     metric_depth: str | None = None
+    tracks: str | None = None
     calibration: dict[str, Any] | None = None
 
     @property
@@ -72,6 +74,7 @@ class JobSpec:
             "phrases": self.phrases,
             "detection_interval_s": self.detection_interval_s,
             "metric_depth": self.metric_depth,
+            "tracks": self.tracks,
         }
 
     def to_json(self) -> dict[str, Any]:

@@ -38,7 +38,7 @@ class TestCreate:
         assert "idempotent-replayed" not in answer.headers
         assert job["state"] == "queued"
         expected = {**wanted, "output": "s3://bucket/out", "attributes": ["pose", "intrinsics", "depth"]}
-        expected["calibration"] = None
+        expected |= {"calibration": None, "tracks": None}
         assert job["spec"] == expected
         assert job["progress"]["frames_expected"] is None
         assert http.get(answer.headers["location"]).json() == job
@@ -116,6 +116,8 @@ class TestCreate:
             ({"scale_from": "height"}, "body.scale_from"),
             ({"scale_from": "height=-1"}, "body.scale_from"),
             ({"metric_depth": "magic"}, "body.metric_depth"),
+            ({"tracks": "magic"}, "body.tracks"),
+            ({"preset": "classical", "tracks": "classical.corners"}, "body"),
             ({"detection_interval_s": 0}, "body.detection_interval_s"),
             ({"phrases": ["x" * 65]}, "body.phrases.0"),
             ({"preset": "vipe_fast", "camera": "equirect"}, "body"),

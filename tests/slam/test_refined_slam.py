@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
 import exact_room
 import numpy as np
@@ -233,10 +232,19 @@ def test_metric_depth_is_asked_once_where_the_camera_is_known() -> None:
     assert len(set(frames)) == len(frames) >= len(found.keyframes)
 
 
+def test_tracks_are_followed_where_their_term_is_on_and_only_where_something_moves() -> None:
+    refiner = RoomRefiner(walk(3))
+    follower = RoomFollower(refiner)
+    run(refiner, 75.0, 0.05, follower=follower, terms=EnergyTerms(sparse_tracks=False))
+    standing = RoomRefiner(np.repeat(walk(3)[:1], 3, axis=0))
+    run(standing, 75.0, 0.05, follower=follower)
+    assert follower.followed == []
+
+
 def test_tracks_mend_what_the_network_says_of_static_things_and_are_taken_back_where_they_contradict_it() -> None:
-    def error(follower: RoomFollower | None, **options: Any) -> float:
+    def error(follower: RoomFollower | None) -> float:
         refiner = RoomRefiner(walk(14), noise_px=0.8)
-        return position_error(run(refiner, 75.0, 0.05, follower=follower, **options), refiner)
+        return position_error(run(refiner, 75.0, 0.05, follower=follower), refiner)
 
     walked = RoomRefiner(walk(14))
     follower = RoomFollower(walked)
@@ -244,6 +252,5 @@ def test_tracks_mend_what_the_network_says_of_static_things_and_are_taken_back_w
     assert with_tracks < 0.7 * without
     # Shot by shot and frame by frame, from the first keyframe to the last.
     assert follower.followed == [list(range(14))]
-    assert error(RoomFollower(walked), terms=EnergyTerms(sparse_tracks=False)) == without
     # What slips by three pixels a frame is further from every answer than anything that is believed.
     assert error(RoomFollower(walked, wrong_px=3.0)) == pytest.approx(without, rel=0.3)

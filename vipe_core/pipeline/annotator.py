@@ -100,7 +100,8 @@ class Annotator:
         require_libraries(self.preset.providers.values())
         self._weights = require_all(self.preset.weights)
         try:
-            self._priors = open_priors(self.preset.matcher, self.preset.intrinsics, self.preset.camera, self.device)
+            asked = self.preset
+            self._priors = open_priors(asked.matcher, asked.sparse, asked.intrinsics, asked.camera, self.device)
             self._depth = open_depth(self.preset.depth, self.preset.metric, self.device)
             self._masks = open_masks(self.preset.masks, self.preset.instances, self.device)
         except RuntimeError as error:
@@ -276,7 +277,7 @@ class Annotator:
             preset=self.preset.name,
             config_hash=self.preset.config_hash,
             device=describe_device(self.device, self.threads),
-            libraries=library_versions(),
+            libraries=library_versions(providers.values()),
             providers=providers,
             weights=self._weights,
             source={

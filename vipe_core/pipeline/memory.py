@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 from vipe_core.ba.problem import Grid
 from vipe_core.errors import OutOfDeviceMemory
-from vipe_core.pipeline.presets import NONE, Preset
+from vipe_core.pipeline.presets import DROID, NONE, Preset
 from vipe_core.priors.droid.memory import MemoryPlan, plan_memory
 from vipe_core.priors.weights import WEIGHTS, selected
 
@@ -44,7 +44,7 @@ def plan_of(preset: Preset, grid: Grid, keyframes: int, *, lean: bool) -> Memory
         lean: In the low-memory profile.
     """
     slam = preset.slam
-    refined = preset.matcher == "droid.network"
+    refined = preset.matcher == DROID
     networks = [provider for provider in preset.providers.values() if provider != NONE and "classical" not in provider]
     others = [_WORK_BYTES.get(provider, _OTHER_WORK_BYTES) for provider in networks if provider != preset.matcher]
     return plan_memory(

@@ -11,11 +11,14 @@ from vipe_core.depth.alignment import AlignmentSettings
 from vipe_core.depth.types import DepthSettings
 from vipe_core.errors import ConfigError
 from vipe_core.priors.instance_settings import InstanceSettings
-from vipe_core.slam.settings import EnergyTerms, SlamSettings
+from vipe_core.slam.settings import SlamSettings
 
 CAMERAS = ("pinhole", "mei", "auto", "equirect")
 NONE = "none"
 """The provider of a role that nobody fills: no tracks, no dense depth, no metric depth, no masks."""
+
+DROID = "droid.network"
+"""Dense matching by the network that is refined in turns with the map."""
 
 FOUND_BY_PHRASES = "hf.grounding_dino_sam2"
 """The provider of masks of what phrases name."""
@@ -39,8 +42,12 @@ METRIC_DEPTH = (
 )
 """Networks that tell the scale."""
 
+CORNERS, CUVSLAM = "classical.corners", "cuvslam.odometry"
+TRACKS = (NONE, CORNERS, CUVSLAM)
+"""Tracks through consecutive frames that join what the DROID network measures."""
+
 _PROVIDER_WEIGHTS: dict[str, tuple[str, ...]] = {
-    "droid.network": ("droid",),
+    DROID: ("droid",),
     FOUND_BY_PHRASES: ("grounding_dino", "sam2_video"),
     VIDEO_DEPTH: ("video_depth_anything", "priorda"),
     **{provider: (provider.partition(".")[2],) for provider in (*GEOCALIB.values(), *METRIC_DEPTH[1:])},
@@ -120,20 +127,28 @@ class PresetOptions:
             none does.
         detection_interval_s: Time between looks for new things.
         metric_depth: Network that tells the scale, one of `METRIC_DEPTH`.
+        tracks: What follows points for the DROID network, one of `TRACKS`.
     """
 
     phrases: tuple[str, ...] | None = None
     detection_interval_s: float | None = None
     metric_depth: str | None = None
+    tracks: str | None = None
 
     def applied(self, preset: Preset) -> Preset:
         """The preset with the changes.
 
         Raises:
-            ConfigError: The phrases or the interval cannot be, or there is no such network.
+            ConfigError: The phrases or the interval cannot be, or there is no such network, or no such tracks.
         """
         if self.metric_depth is not None and self.metric_depth not in METRIC_DEPTH:
             raise ConfigError(f"unknown metric depth {self.metric_depth!r}; on offer: {', '.join(METRIC_DEPTH)}")
+        if self.tracks is not None and self.tracks not in TRACKS:
+            raise ConfigError(f"unknown tracks {self.tracks!r}; on offer: {', '.join(TRACKS)}")
+        if self.tracks is not None and preset.matcher != DROID:
+            raise ConfigError(
+                f"the preset {preset.name} has tracks of its own: only those of the DROID network are chosen"
+            )
         masks, instances = preset.masks, preset.instances
         if self.phrases is not None:
             masks = FOUND_BY_PHRASES if self.phrases else NONE
@@ -144,7 +159,8 @@ class PresetOptions:
                 raise ConfigError("a time between detections means nothing without phrases to look for")
             instances = dataclasses.replace(instances, interval_s=self.detection_interval_s)
         metric = preset.metric if self.metric_depth is None else self.metric_depth
-        return dataclasses.replace(preset, masks=masks, instances=instances, metric=metric)
+        sparse = preset.sparse if self.tracks is None else self.tracks
+        return dataclasses.replace(preset, masks=masks, instances=instances, metric=metric, sparse=sparse)
 
 
 _CLASSICAL = Preset(
@@ -155,12 +171,12 @@ _CLASSICAL = Preset(
     intrinsics="classical.two_view_focal",
     depth="classical.plane_sweep",
 )
-# The network was trained on pictures of this size, and its edges know what moves: no tracks, no masks beside it.
+# The network was trained on pictures of this size, and its edges know what moves: no masks beside it.
 _NETWORK = dataclasses.replace(
     _CLASSICAL,
-    matcher="droid.network",
+    matcher=DROID,
     sparse=NONE,
-    slam=SlamSettings(working_area_px=512 * 384, terms=EnergyTerms(sparse_tracks=False)),
+    slam=SlamSettings(working_area_px=512 * 384),
     dense_depth=DepthSettings.fast(),
 )
 _PRESETS = {
@@ -175,6 +191,7 @@ _PRESETS = {
         dataclasses.replace(
             _NETWORK,
             name="vipe",
+            sparse=CORNERS,
             intrinsics=GEOCALIB["pinhole"],
             depth=VIDEO_DEPTH,
             metric="nvidia_vipe.metric3d_large",
@@ -195,8 +212,8 @@ PRESETS = tuple(_PRESETS)
 `wide_angle` estimates the bend of the lens as well; `panorama` is for equirectangular video. `vipe_fast` and
 `pose_only` find poses as the paper does, by the DROID network and bundle adjustment in turns, and need its weights; the
 one has coarse dense depth, the other none. `vipe` is the paper's whole: masks of what its phrases name, the camera from
-GeoCalib, metric depth, and video depth aligned to the map; it needs the extras `hf` and `nvidia-vipe`, and their
-weights."""
+GeoCalib, tracks of corners, metric depth, and video depth aligned to the map; it needs the extras `hf` and
+`nvidia-vipe`, and their weights."""
 
 
 def resolve(preset: str | Preset, camera: str | None = None, options: PresetOptions | None = None) -> Preset:

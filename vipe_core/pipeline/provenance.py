@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import importlib.metadata
 import platform
+from collections.abc import Iterable
 
 _LIBRARIES = ("torch", "numpy", "opencv-python-headless", "av", "poselib", "scipy", "numba")
+_OF_PROVIDERS = {"hf": "transformers", "nvidia_vipe": "nvidia-vipe", "cuvslam": "cuvslam"}
 
 
 def engine_version() -> str:
@@ -16,10 +18,12 @@ def engine_version() -> str:
         return "unknown"
 
 
-def library_versions() -> dict[str, str]:
-    """Library -> version, of those whose code touches the numbers."""
+def library_versions(providers: Iterable[str] = ()) -> dict[str, str]:
+    """Library -> version, of those whose code touches the numbers with these providers."""
     versions = {"python": platform.python_version()}
-    for library in _LIBRARIES:
+    families = {provider.partition(".")[0] for provider in providers}
+    used = (library for family, library in _OF_PROVIDERS.items() if family in families)
+    for library in (*_LIBRARIES, *used):
         try:
             versions[library] = importlib.metadata.version(library)
         except importlib.metadata.PackageNotFoundError:

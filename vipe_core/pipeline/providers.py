@@ -8,17 +8,18 @@ from __future__ import annotations
 import dataclasses
 import importlib.util
 from collections.abc import Callable, Iterable
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import torch
 
 from vipe_core.errors import ConfigError, LibraryMissing
-from vipe_core.pipeline.presets import FOUND_BY_PHRASES, GEOCALIB, NONE, VIDEO_DEPTH
+from vipe_core.pipeline.presets import CORNERS, CUVSLAM, DROID, FOUND_BY_PHRASES, GEOCALIB, NONE, VIDEO_DEPTH
 from vipe_core.priors.classical import classical_priors
+from vipe_core.priors.classical.following import CornerFollower
 from vipe_core.priors.droid import DroidMatcher, load_network
 from vipe_core.priors.instance_settings import InstanceSettings
 from vipe_core.priors.instances import FollowedInstances
-from vipe_core.priors.protocols import DepthFamily, InstanceMasks, MetricDepth, PriorFamily
+from vipe_core.priors.protocols import DepthFamily, InstanceMasks, MetricDepth, PointFollower, PriorFamily
 from vipe_core.priors.rectified import Rectified
 from vipe_core.priors.weights import folder_of, path_of
 
@@ -35,6 +36,7 @@ PriorOpener = Callable[[str, torch.device], PriorMaker]
 """(camera model, device) -> maker; loads what all videos share."""
 
 MetricOpener = Callable[[torch.device], MetricDepth]
+FollowerOpener = Callable[[torch.device], PointFollower]
 MaskOpener = Callable[[InstanceSettings, torch.device], InstanceMasks]
 
 
@@ -44,10 +46,15 @@ def require_libraries(providers: Iterable[str]) -> None:
     Raises:
         LibraryMissing: One is not; the message says what installs it.
     """
+    from vipe_core.priors.cuvslam import INSTALL as CUVSLAM_INSTALL
     from vipe_core.priors.hf.loading import EXTRA
     from vipe_core.priors.nvidia_vipe.loading import INSTALL
 
-    needed = {"hf": ("transformers", EXTRA), "nvidia_vipe": ("vipe", INSTALL)}
+    needed = {
+        "hf": ("transformers", EXTRA),
+        "nvidia_vipe": ("vipe", INSTALL),
+        "cuvslam": ("cuvslam", CUVSLAM_INSTALL),
+    }
     for provider in providers:
         library, command = needed.get(provider.partition(".")[0], ("", ""))
         if library and importlib.util.find_spec(library) is None:
@@ -100,6 +107,12 @@ def _unik3d(device: torch.device) -> MetricDepth:
     return UniK3d.load(folder_of("unik3d"), device)
 
 
+def _cuvslam(device: torch.device) -> PointFollower:
+    from vipe_core.priors.cuvslam import CuvslamFollower
+
+    return CuvslamFollower.load(device)
+
+
 def _found_by_phrases(settings: InstanceSettings, device: torch.device) -> InstanceMasks:
     from vipe_core.priors.hf.grounding_dino import LONGEST, SHORTEST, GroundingDino
     from vipe_core.priors.hf.sam2_video import Sam2Video
@@ -123,6 +136,7 @@ _METRIC: dict[str, MetricOpener] = {
     "nvidia_vipe.unidepth": _unidepth,
     "nvidia_vipe.unik3d": _unik3d,
 }
+_TRACKS: dict[str, FollowerOpener] = {CORNERS: lambda device: CornerFollower(), CUVSLAM: _cuvslam}
 _MASKS: dict[str, MaskOpener] = {FOUND_BY_PHRASES: _found_by_phrases}
 
 
@@ -143,27 +157,32 @@ def _droid(camera: str, device: torch.device) -> PriorMaker:
     return family
 
 
-_PRIORS: dict[str, PriorOpener] = {"classical.dis_flow": _classical, "droid.network": _droid}
+_PRIORS: dict[str, PriorOpener] = {"classical.dis_flow": _classical, DROID: _droid}
 
 
-def open_priors(matcher: str, intrinsics: str, camera: str, device: torch.device) -> PriorMaker:
-    """The providers of the geometric roles, by that of dense matching; the initial camera is the family's own unless
-    `intrinsics` names a network.
+def open_priors(matcher: str, sparse: str, intrinsics: str, camera: str, device: torch.device) -> PriorMaker:
+    """The providers of the geometric roles, by that of dense matching.
+
+    The initial camera is the family's own unless `intrinsics` names a network; so are tracks unless `sparse` names
+    what follows points for one that is refined.
 
     Raises:
-        ConfigError: There are none.
+        ConfigError: There are none, or they need another device.
+        LibraryMissing: The library of the tracks is not installed.
         WeightsMissing: Their weights are not on this machine; the message names the command that fetches them.
         WeightsInvalid: The weights are damaged.
     """
     if matcher not in _PRIORS:
         raise ConfigError(f"unknown provider of dense matching {matcher!r}; on offer: {', '.join(sorted(_PRIORS))}")
     maker = _PRIORS[matcher](camera, device)
-    if intrinsics not in GEOCALIB.values():
-        return maker
-    from vipe_core.priors.nvidia_vipe.geocalib import GeoCalibInit
+    changed: dict[str, Any] = {}
+    if sparse in _TRACKS:
+        changed["follower"] = _TRACKS[sparse](device)
+    if intrinsics in GEOCALIB.values():
+        from vipe_core.priors.nvidia_vipe.geocalib import GeoCalibInit
 
-    learned = GeoCalibInit.load(path_of(intrinsics.partition(".")[2]), camera, device)
-    return lambda: dataclasses.replace(maker(), intrinsics=learned)
+        changed["intrinsics"] = GeoCalibInit.load(path_of(intrinsics.partition(".")[2]), camera, device)
+    return lambda: dataclasses.replace(maker(), **changed)
 
 
 def register_depth(name: str, opener: DepthOpener) -> None:
