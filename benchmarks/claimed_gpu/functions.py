@@ -17,6 +17,8 @@ if TYPE_CHECKING:
 # What Python's own types of numbers stand for.
 _NUMBERS = {float: torch.float64, int: torch.int64, bool: torch.bool}
 
+_PINNED = "claimed_pinned"
+
 Special = Callable[["ClaimedGpu", Any, Sequence[Any], dict[str, Any]], Any]
 
 
@@ -67,6 +69,23 @@ def _cuda(gpu: ClaimedGpu, func: Any, args: Sequence[Any], kwargs: dict[str, Any
     if isinstance(args[0], ClaimedTensor):
         return args[0]
     return gpu.up(args[0], non_blocking=kwargs.get("non_blocking", False))
+
+
+def is_pinned(tensor: Tensor) -> bool:
+    """Whether a tensor of the host was pinned here."""
+    return getattr(tensor, _PINNED, False)
+
+
+def _pin_memory(gpu: ClaimedGpu, func: Any, args: Sequence[Any], kwargs: dict[str, Any]) -> Any:
+    if isinstance(args[0], ClaimedTensor):
+        raise RuntimeError("cannot pin memory that is not on the host")
+    pinned = args[0].clone()
+    setattr(pinned, _PINNED, True)
+    return pinned
+
+
+def _is_pinned(gpu: ClaimedGpu, func: Any, args: Sequence[Any], kwargs: dict[str, Any]) -> bool:
+    return is_pinned(args[0])
 
 
 def _tensor(gpu: ClaimedGpu, func: Any, args: Sequence[Any], kwargs: dict[str, Any]) -> Any:
@@ -199,6 +218,8 @@ SPECIAL: dict[Any, Special] = {
     torch.Tensor.to: _to,
     torch.Tensor.cpu: _cpu,
     torch.Tensor.cuda: _cuda,
+    torch.Tensor.pin_memory: _pin_memory,
+    torch.Tensor.is_pinned: _is_pinned,
     torch.tensor: _tensor,
     torch.as_tensor: _tensor,
     torch.asarray: _tensor,

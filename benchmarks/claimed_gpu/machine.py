@@ -17,9 +17,10 @@ import torch
 from torch import Tensor
 from torch.overrides import TorchFunctionMode
 
-from benchmarks.claimed_gpu.functions import SPECIAL, claims, stripped
+from benchmarks.claimed_gpu.functions import SPECIAL, claims, is_pinned, stripped
 from benchmarks.claimed_gpu.runtime import stand_ins
 from benchmarks.claimed_gpu.tensor import ClaimedTensor, dispatched_by
+from vipe_core import transfer
 from vipe_core.ba import cuda, operator
 from vipe_core.ba.cuda.compiler import Specialisation
 from vipe_core.ba.cuda.launcher import Launch, Launcher
@@ -29,6 +30,8 @@ from vipe_core.priors.droid.kernels import LookupKernels
 _ENGINE = str(Path(operator.__file__).parents[1])
 _BETWEEN = (str(Path(__file__).parent), str(Path(torch.__file__).parent))
 
+# Pageable memory that is copied to where it can be sent from before a call returns.
+_STAGED_BYTES = 64 << 10
 _COPIES = ("copy_", "_to_copy")
 _INDEXED = ("index", "index_put", "index_put_", "_unsafe_index", "_unsafe_index_put", "_index_put_impl_")
 # Whose shapes or errors depend on values: the host reads a number before it goes on.
@@ -106,11 +109,7 @@ class ClaimedGpu(TorchFunctionMode):
 
     def up(self, tensor: Tensor, dtype: torch.dtype | None = None, *, non_blocking: bool = False) -> ClaimedTensor:
         """A copy on the device of a tensor of the host."""
-        if non_blocking:
-            self._refuse_in_capture("upload")
-            self.copies += 1
-        else:
-            self.wait("upload")
+        self._uploaded(tensor, blocking=not non_blocking)
         return ClaimedTensor(tensor.to(dtype or tensor.dtype, copy=True))
 
     def down(self, tensor: ClaimedTensor, dtype: torch.dtype | None = None) -> Tensor:
@@ -156,7 +155,10 @@ class ClaimedGpu(TorchFunctionMode):
         elif name == "copy_":
             if of_host:
                 blocking = not (args[2] if len(args) > 2 else kwargs.get("non_blocking", False))
-                self._copy_between(isinstance(args[0], ClaimedTensor), blocking=blocking)
+                if isinstance(args[0], ClaimedTensor):
+                    self._uploaded(args[1], blocking=blocking)
+                else:
+                    self.wait("read")
         elif name in _INDEXED:
             self._require_indices(func, args)
         elif of_host:
@@ -165,12 +167,13 @@ class ClaimedGpu(TorchFunctionMode):
             self.wait(_READING[name])
         return self._run(func, name, args, stripped(kwargs))
 
-    def _copy_between(self, upwards: bool, *, blocking: bool) -> None:
-        if upwards and not blocking:
+    def _uploaded(self, tensor: Tensor, *, blocking: bool) -> None:
+        """What is not pinned and larger than the driver's own buffer is copied piece by piece, behind all else."""
+        if blocking or not (is_pinned(tensor) or tensor.nbytes <= _STAGED_BYTES):
+            self.wait("upload")
+        else:
             self._refuse_in_capture("upload")
             self.copies += 1
-        else:
-            self.wait("upload" if upwards else "read")
 
     def _require_indices(self, func: Any, args: Sequence[Any]) -> None:
         """Indices may be on the host: they are copied. A mask is counted first, unless one number is put into it."""
@@ -295,7 +298,10 @@ def _place(kind: str) -> Place:
     """The innermost line of the engine that the host is in; outside of it, of whoever calls torch."""
     frame: Any = sys._getframe(2)
     caller = None
-    while frame is not None and not frame.f_code.co_filename.startswith(_ENGINE):
+    # What only carries is asked by somebody else.
+    while frame is not None and (
+        not (name := frame.f_code.co_filename).startswith(_ENGINE) or name == transfer.__file__
+    ):
         if caller is None and not frame.f_code.co_filename.startswith(_BETWEEN):
             caller = frame
         frame = frame.f_back

@@ -17,6 +17,7 @@ from benchmarks.gpu_pipeline import Run, Workload
 from vipe_core.priors.droid import DroidNetwork
 from vipe_core.priors.droid.graphs import GraphCache
 from vipe_core.slam.keyframes import KeyframeMap
+from vipe_core.transfer import downloaded, uploaded
 
 pytestmark = pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
 
@@ -65,6 +66,14 @@ def test_what_makes_the_host_wait_is_counted() -> None:
         gpu.waits.clear()
         _ = torch.tensor([1], device="cuda"), torch.ones(4).cuda(), there[[0, 2]]
         assert kinds(gpu) == ["upload"] * 3
+        # The driver keeps a copy of what is small until it is sent; what is large has to be pinned.
+        gpu.waits.clear()
+        frame = torch.ones(1 << 20, dtype=torch.uint8)
+        large = uploaded(frame, there.device)
+        assert kinds(gpu) == []
+        frame.to("cuda", non_blocking=True)
+        assert kinds(gpu) == ["upload"]
+        assert torch.equal(large.cpu(), frame)
         gpu.waits.clear()
         _ = there[there > 0], there.unique(), there.nonzero()
         assert kinds(gpu) == ["shape"] * 3
@@ -73,6 +82,19 @@ def test_what_makes_the_host_wait_is_counted() -> None:
         with pytest.raises(RuntimeError, match="synchronizing"):
             there.sum().item()
         assert place.endswith("test_what_makes_the_host_wait_is_counted")
+
+
+def test_tensors_of_any_type_are_read_in_one_piece() -> None:
+    with claimed_gpu() as gpu:
+        there = torch.arange(6.0, device="cuda").view(2, 3) - 2
+        given = there > 0, there.half(), there.double().mT, there[0, :0], there[1, 1]
+        expected = [one.cpu().numpy() for one in given]
+        gpu.waits.clear()
+        found = downloaded(*given)
+        assert kinds(gpu) == ["read"]
+    for one, other in zip(found, expected, strict=True):
+        assert one.dtype == other.dtype
+        np.testing.assert_array_equal(one, other)
 
 
 def test_graphs_are_replayed_and_waits_are_refused_while_they_are_captured() -> None:

@@ -23,6 +23,7 @@ from vipe_core.slam.graph import Graph
 from vipe_core.slam.keyframes import KeyframeMap
 from vipe_core.slam.settings import SlamSettings
 from vipe_core.slam.smoothness import smooth_inverse_depth
+from vipe_core.transfer import downloaded, uploaded
 
 logger = logging.getLogger(__name__)
 
@@ -207,12 +208,12 @@ class Adjuster:
             return None
         if free_scale or free_extrinsics:
             result = self._arrive(keyframes, graph, frames, edges, problem, result)
-        new_poses = result.state.cam_from_world.cpu().numpy()
-        new_depths = result.state.inverse_depth.cpu().numpy()
+        after = result.state
+        new_poses, new_depths, intrinsics = downloaded(after.cam_from_world, after.inverse_depth, after.intrinsics)
         for row, k in enumerate(frames):
             keyframes.set_pose(k, new_poses[row])
             keyframes.set_depth(k, new_depths[row])
-        keyframes.intrinsics = result.state.intrinsics.cpu().numpy().astype(np.float64)
+        keyframes.intrinsics = intrinsics.astype(np.float64)
         if free_extrinsics and result.state.cam_from_rig is not None:
             keyframes.cam_from_rig = result.state.cam_from_rig.cpu().numpy()
             self._take_extrinsics(keyframes, result)
@@ -461,10 +462,10 @@ class Adjuster:
     def state(self, poses: Array, depths: Array, intrinsics: Array, cam_from_rig: Array | None = None) -> State:
         """Poses (N, 4, 4), inverse depths (N, P), intrinsics and extrinsics on the device."""
         return State(
-            cam_from_world=torch.from_numpy(np.ascontiguousarray(poses)).to(self.device, non_blocking=True),
-            inverse_depth=torch.from_numpy(np.ascontiguousarray(depths)).to(self.device, non_blocking=True),
-            intrinsics=torch.from_numpy(np.array(intrinsics, dtype=np.float64)).to(self.device, non_blocking=True),
-            cam_from_rig=None if cam_from_rig is None else torch.from_numpy(cam_from_rig.copy()).to(self.device),
+            cam_from_world=uploaded(np.ascontiguousarray(poses), self.device),
+            inverse_depth=uploaded(np.ascontiguousarray(depths), self.device),
+            intrinsics=uploaded(np.array(intrinsics, dtype=np.float64), self.device),
+            cam_from_rig=None if cam_from_rig is None else uploaded(cam_from_rig.copy(), self.device),
         )
 
     def _depth_prior(
@@ -484,7 +485,7 @@ class Adjuster:
         )
         median = max(float(np.median(depths)), 1e-6)
         information = np.full(depths.shape, self._depth_prior_weight / median**2, dtype=np.float32)
-        return torch.from_numpy(prior).to(self.device), torch.from_numpy(information).to(self.device)
+        return uploaded(prior, self.device), uploaded(information, self.device)
 
 
 def _thinned(problem: Problem, state: State) -> tuple[Problem, State]:
@@ -510,7 +511,7 @@ def rig_of(frames: Sequence[int], num_views: int, device: torch.device) -> Rig:
     """The rig behind keyframes of a map, in the order of a problem."""
     instants = np.unique(np.array(frames) // num_views, return_inverse=True)[1]
     views = np.array(frames) % num_views
-    return Rig(torch.from_numpy(instants).to(device), torch.from_numpy(views).to(device))
+    return Rig(uploaded(instants, device), uploaded(views, device))
 
 
 def _nothing() -> None:

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from vipe_core.ba.problem import Edges
 from vipe_core.priors.protocols import Match
 from vipe_core.slam.keyframes import KeyframeMap
+from vipe_core.transfer import uploaded
 
 Array = NDArray[Any]
 _AGREE_PX = 2.0
@@ -112,6 +113,6 @@ class Graph:
         return Edges(
             source=torch.tensor([number[i] for i, _ in edges], dtype=torch.int64),
             target=torch.tensor([number[j] for _, j in edges], dtype=torch.int64),
-            target_px=torch.from_numpy(target_px).to(device),
-            weight=torch.from_numpy(weight).to(device),
+            target_px=uploaded(target_px, device),
+            weight=uploaded(weight, device),
         )

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from vipe_core.ba.problem import Edges, Free, Problem, State
+from vipe_core.ba.problem import Edges, Free, Problem
 from vipe_core.geometry.arrays import interpolate_trajectory, relative
 from vipe_core.priors.protocols import Aligner, DenseMatcher, Match, Refiner, SparseTracker
 from vipe_core.slam.adjustment import SETTLE, Step
@@ -26,6 +26,7 @@ from vipe_core.slam.reprojection import Induced, Reprojector
 from vipe_core.slam.rotation import Link, RotationFitter
 from vipe_core.slam.segmentation import UNKNOWN, carried
 from vipe_core.slam.selection import Report
+from vipe_core.transfer import uploaded
 
 Array = NDArray[Any]
 
@@ -314,8 +315,8 @@ class _ShotInfill:
         edges = Edges(
             source=torch.tensor([i for i, _, _ in links], dtype=torch.int64),
             target=torch.tensor([j for _, j, _ in links], dtype=torch.int64),
-            target_px=torch.from_numpy(np.stack([match.target_px for _, _, match in links])).to(device),
-            weight=torch.from_numpy(weight).to(device),
+            target_px=uploaded(np.stack([match.target_px for _, _, match in links]), device),
+            weight=uploaded(weight, device),
         )
         start = np.stack([self._keyframes.pose(k) for k in sources] + [frame.start for frame in pending])
         depths = np.ones((total, self._keyframes.grid.num_cells), dtype=np.float32)
@@ -329,11 +330,7 @@ class _ShotInfill:
                 inverse_depth=torch.zeros(total, dtype=torch.bool),
             ),
         )
-        state = State(
-            cam_from_world=torch.from_numpy(start).to(device),
-            inverse_depth=torch.from_numpy(depths).to(device),
-            intrinsics=torch.from_numpy(self._keyframes.intrinsics.copy()).to(device),
-        )
+        state = self._adjuster.state(start, depths, self._keyframes.intrinsics)
         result = self._adjuster.anneal(problem, state, schedule)
         return None if result is None else result.state.cam_from_world[first:].cpu().numpy()
 

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from vipe_core.ba.problem import Edges, Free, Problem, Rig, State
+from vipe_core.ba.problem import Edges, Free, Problem, Rig
 from vipe_core.geometry.arrays import interpolate_trajectory, relative
 from vipe_core.priors.protocols import Aligner, DenseMatcher, Match, SparseTracker
 from vipe_core.slam.adjustment import SETTLE, Step
@@ -25,6 +25,7 @@ from vipe_core.slam.rig_consensus import Sighting, consensus_rig_pose
 from vipe_core.slam.rig_frames import EncodedRig
 from vipe_core.slam.segmentation import carried
 from vipe_core.slam.selection import Report
+from vipe_core.transfer import uploaded
 
 Array = NDArray[Any]
 
@@ -220,7 +221,7 @@ class _RigInfill:
         edges = Edges(
             source=torch.tensor([number[sighting.keyframe] for _, sighting in links]),
             target=torch.tensor([at + sighting.view for at, sighting in links]),
-            target_px=torch.from_numpy(np.stack([sighting.match.target_px for _, sighting in links])).to(device),
+            target_px=uploaded(np.stack([sighting.match.target_px for _, sighting in links]), device),
             weight=torch.from_numpy(
                 np.stack([sighting.match.weight * sighting.usable[:, None] for _, sighting in links])
             ).to(device),
@@ -232,8 +233,8 @@ class _RigInfill:
         behind = np.unique(np.array(sources) // views, return_inverse=True)[1]
         new, every = np.repeat(np.arange(len(pending)), views), np.tile(np.arange(views), len(pending))
         rig = Rig(
-            torch.from_numpy(np.concatenate((behind, behind.max() + 1 + new))).to(device),
-            torch.from_numpy(np.concatenate((np.array(sources) % views, every))).to(device),
+            uploaded(np.concatenate((behind, behind.max() + 1 + new)), device),
+            uploaded(np.concatenate((np.array(sources) % views, every)), device),
         )
         problem = Problem(
             camera_model=keyframes.camera_model,
@@ -245,12 +246,7 @@ class _RigInfill:
             ),
             rig=rig,
         )
-        state = State(
-            cam_from_world=torch.from_numpy(np.stack(start)).to(device),
-            inverse_depth=torch.from_numpy(depths).to(device),
-            intrinsics=torch.from_numpy(keyframes.intrinsics.copy()).to(device),
-            cam_from_rig=torch.from_numpy(self._mounts.copy()).to(device),
-        )
+        state = self._map.adjuster.state(np.stack(start), depths, keyframes.intrinsics, self._mounts)
         result = self._map.adjuster.anneal(problem, state, schedule)
         if result is None:
             return None

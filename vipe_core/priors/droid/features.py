@@ -13,8 +13,9 @@ from torch import Tensor
 from torch.nn import functional
 
 from vipe_core.ba.problem import Grid
-from vipe_core.priors.droid.network import DroidNetwork, uploaded
+from vipe_core.priors.droid.network import DroidNetwork
 from vipe_core.priors.protocols import WorkingFrame
+from vipe_core.transfer import uploaded
 
 Array = NDArray[Any]
 

@@ -17,6 +17,7 @@ from vipe_core.priors.droid.features import OFFSET_PX, STRIDE, DroidFeatures, en
 from vipe_core.priors.droid.network import FRAME_STEP, DroidNetwork
 from vipe_core.priors.droid.refinement import DroidRefinement
 from vipe_core.priors.protocols import Match, WorkingFrame
+from vipe_core.transfer import downloaded, uploaded
 
 Array = NDArray[Any]
 
@@ -120,7 +121,7 @@ class DroidMatcher:
         refinement, seen = self._between(pairs)
         for row, guess_px in enumerate(guesses):
             if guess_px is not None:
-                given = torch.from_numpy(np.asarray(guess_px, np.float32)).to(seen.device)
+                given = uploaded(np.asarray(guess_px, np.float32), seen.device)
                 seen = seen.clone()
                 seen[row] = torch.where(given.isfinite(), given, seen[row])
         for _ in range(updates):
@@ -133,7 +134,8 @@ class DroidMatcher:
             kept = weight * (inside * _sampled(target.usable, target_px, target.grid))[:, None]
             found.append(torch.cat((target_px, kept, inside[:, None]), dim=-1))
         # All of it is read at once: the host waits for the GPU here.
-        return [_matched(one) for one in torch.stack(found).cpu().numpy()]
+        (read,) = downloaded(torch.stack(found))
+        return [_matched(one) for one in read]
 
 
 def _matched(found: Array) -> Match:

@@ -12,6 +12,7 @@ from torch.nn import functional
 from vipe_core.priors.droid.encoder import Encoder
 from vipe_core.priors.droid.graphs import GraphCache
 from vipe_core.priors.droid.update import HIDDEN, Updated, UpdateOperator
+from vipe_core.transfer import uploaded
 
 FEATURES = 128
 """Channels of what is correlated."""
@@ -128,9 +129,3 @@ class DroidNetwork(nn.Module):
 def _filled(given: Tensor, more: int) -> Tensor:
     """With so many more rows of zeros."""
     return functional.pad(given, (0, 0, 0, 0, 0, 0, 0, more)) if more else given
-
-
-def uploaded(tensor: Tensor, device: torch.device) -> Tensor:
-    """A tensor of the host on a device, without waiting for what runs there: memory that is not pinned is copied to
-    where the driver sends it from before this returns."""
-    return tensor.to(device, non_blocking=True)

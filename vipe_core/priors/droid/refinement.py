@@ -10,9 +10,10 @@ from torch import Tensor
 from vipe_core.ba.problem import Grid
 from vipe_core.priors.droid.correlation import Correlation, FeatureCorrelation, VolumeCorrelation
 from vipe_core.priors.droid.features import DroidFeatures
-from vipe_core.priors.droid.network import DroidNetwork, uploaded
+from vipe_core.priors.droid.network import DroidNetwork
 from vipe_core.priors.droid.update import shares
 from vipe_core.priors.protocols import Refined
+from vipe_core.transfer import uploaded
 
 # DROID weighs a residual of one cell by 0.001 and adds a fifth of the damping to the depths' diagonal. Here residuals
 # are in pixels, an eighth of a cell, with a weight of one.

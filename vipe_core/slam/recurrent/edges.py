@@ -16,6 +16,7 @@ from vipe_core.slam.graph import Graph
 from vipe_core.slam.keyframes import KeyframeMap
 from vipe_core.slam.recurrent.depth_prior import DepthPrior
 from vipe_core.slam.recurrent.tracks import EdgeTracks
+from vipe_core.transfer import downloaded, uploaded
 
 Pair = tuple[int, int]
 
@@ -164,11 +165,12 @@ class RefinedEdges:
         result = self._adjuster.anneal(problem, state, (Step("none", 1.0, iterations, 1e-4),))
         if result is None:
             return None
-        poses, depths = result.state.cam_from_world.cpu().numpy(), result.state.inverse_depth.cpu().numpy()
+        after = result.state
+        poses, depths, intrinsics = downloaded(after.cam_from_world, after.inverse_depth, after.intrinsics)
         for row, k in enumerate(frames):
             self._keyframes.set_pose(k, poses[row])
             self._keyframes.set_depth(k, depths[row])
-        self._keyframes.intrinsics = result.state.intrinsics.cpu().numpy().astype(np.float64)
+        self._keyframes.intrinsics = intrinsics.astype(np.float64)
         return result
 
     def seen(self, pairs: Sequence[Pair]) -> Tensor:
@@ -176,7 +178,7 @@ class RefinedEdges:
         frames = sorted({k for edge in pairs for k in edge})
         number = {k: row for row, k in enumerate(frames)}
         ends = torch.tensor([[number[i], number[j]] for i, j in pairs], dtype=torch.int64)
-        ends = ends.to(self._adjuster.device, non_blocking=True)
+        ends = uploaded(ends, self._adjuster.device)
         keyframes = self._keyframes
         px, valid = reproject(keyframes.camera_model, keyframes.grid, self._state(frames), ends[:, 0], ends[:, 1])
         return torch.where(valid[..., None], px, torch.nan)
@@ -189,7 +191,7 @@ class RefinedEdges:
         """
         if self._target_px is None or self._weight is None:
             return
-        targets, weights = self._target_px.cpu().numpy(), self._weight.cpu().numpy()
+        targets, weights = downloaded(self._target_px, self._weight)
         for (i, j), target_px, weight in zip(self.active, targets, weights, strict=True):
             graph.add(i, j, Match(target_px, weight, float((weight.max(axis=1) > 0.5).mean())))
 
@@ -201,7 +203,7 @@ class RefinedEdges:
         staying = (each + _LEAST_DAMPING) / median**2
         if self._prior is None:
             return state.inverse_depth, staying
-        said = torch.from_numpy(self._prior.inverse_depths(frames)).to(state.inverse_depth)
+        said = uploaded(self._prior.inverse_depths(frames), state.inverse_depth.device).to(state.inverse_depth)
         known = (said > 0) * (self._prior_information / median**2)
         information = staying + known
         return (staying * state.inverse_depth + known * said) / information, information
@@ -233,5 +235,5 @@ class RefinedEdges:
         self.active = [self.active[row] for row in rows]
         self._ages = [self._ages[row] for row in rows]
         if self._target_px is not None and self._weight is not None:
-            index = torch.tensor(rows, dtype=torch.int64).to(self._target_px.device, non_blocking=True)
+            index = uploaded(torch.tensor(rows, dtype=torch.int64), self._target_px.device)
             self._target_px, self._weight = self._target_px[index], self._weight[index]

@@ -17,6 +17,7 @@ from vipe_core.priors.protocols import Match, Refiner
 from vipe_core.slam.adjustment import Adjuster, Step
 from vipe_core.slam.keyframes import KeyframeMap
 from vipe_core.slam.recurrent.settings import RefinementSettings
+from vipe_core.transfer import downloaded, uploaded
 
 Array = NDArray[Any]
 
@@ -70,16 +71,18 @@ class FramePoser:
         edges = [(k, row) for row, frame in enumerate(frames) for k in frame.sources]
         ends = torch.tensor([[number[k], first + row] for k, row in edges], dtype=torch.int64)
         source, target = ends[:, 0].contiguous(), ends[:, 1].contiguous()
+        # A graph is laid out on the host, and read where the state is.
+        there = uploaded(ends, device)
         depths = np.ones((total, keyframes.grid.num_cells), dtype=np.float32)
         depths[:first] = np.stack([keyframes.depth(k) for k in sources])
         poses = np.stack([*(keyframes.pose(k) for k in sources), *(frame.start for frame in frames)])
         state = self._adjuster.state(poses, depths, keyframes.intrinsics)
-        kept = torch.from_numpy(np.stack([self._usable[k] for k, _ in edges])).to(device)
+        kept = uploaded(np.stack([self._usable[k] for k, _ in edges]), device)
         free = Free(poses=torch.arange(total) >= first, inverse_depth=torch.zeros(total, dtype=torch.bool))
         refinement = self._refiner.begin(keyframes.grid, lean=self._settings.lean)
         step = Step("none", 1.0, self._settings.iterations, 1e-4)
         for update in range(self._settings.fill_updates):
-            px, valid = reproject(keyframes.camera_model, keyframes.grid, state, source, target)
+            px, valid = reproject(keyframes.camera_model, keyframes.grid, state, there[:, 0], there[:, 1])
             seen = torch.where(valid[..., None], px, torch.nan)
             if update == 0:
                 refinement.add([(keyframes.features[k], frames[row].features) for k, row in edges], seen)
@@ -89,9 +92,9 @@ class FramePoser:
             result = self._adjuster.anneal(problem, state, (step,))
             if result is not None:
                 state = result.state
-        targets, weights = refined.target_px.cpu().numpy(), refined.weight.cpu().numpy()
+        poses, targets, weights = downloaded(state.cam_from_world[first:], refined.target_px, refined.weight)
         matches: list[list[tuple[int, Match]]] = [[] for _ in frames]
         for (k, row), target_px, weight in zip(edges, targets, weights, strict=True):
             sure = float((weight.max(axis=1) > 0.5).mean())
             matches[row].append((k, Match(target_px, weight, sure)))
-        return state.cam_from_world[first:].cpu().numpy(), [tuple(each) for each in matches]
+        return poses, [tuple(each) for each in matches]
