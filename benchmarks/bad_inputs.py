@@ -20,7 +20,7 @@ from dataclasses import dataclass, field
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from threading import Thread
-from typing import Any
+from typing import Any, ParamSpec
 
 import cv2
 import numpy as np
@@ -31,6 +31,8 @@ from vipe_core.errors import VipeError
 
 _LENS = {"version": 1, "model": "pinhole", "width": 96, "height": 64, "fx": 90, "fy": 90, "cx": 48, "cy": 32}
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "bad-inputs.md"
+
+P = ParamSpec("P")
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,9 +64,11 @@ class _Bench:
         path.write_bytes(content.encode() if isinstance(content, str) else content)
         return path
 
-    def tried(self, kind: str, what: str, expected: str, attempt: Callable[[], object]) -> None:
+    def tried(
+        self, kind: str, what: str, expected: str, attempt: Callable[P, object], *arguments: P.args, **options: P.kwargs
+    ) -> None:
         try:
-            attempt()
+            attempt(*arguments, **options)
             code, message = "accepted", ""
         except (VipeError, ServiceError) as error:
             code, message = error.code, str(error)
@@ -127,7 +131,9 @@ def _media(bench: _Bench) -> None:
             "media",
             what,
             code,
-            lambda path=path, limits=limits: list(open_source(path, limits=Limits(**limits)).frames()),  # type: ignore[misc]
+            lambda at, within: list(open_source(at, limits=within).frames()),
+            path,
+            Limits(**limits),
         )
     bench.tried("media", "a file that is not there", "media_not_found", lambda: open_source(bench.folder / "none.mp4"))
     os.mkfifo(bench.folder / "pipe.mp4")
@@ -156,7 +162,7 @@ def _images(bench: _Bench) -> None:
         for name, content in files.items():
             bench.file(f"{folder}/{name}", content)
         path = bench.folder / folder
-        bench.tried("images", what, code, lambda path=path: list(open_source(path).frames()))  # type: ignore[misc]
+        bench.tried("images", what, code, lambda at: list(open_source(at).frames()), path)
     linked = bench.folder / "linked"
     linked.mkdir()
     (linked / "0.png").symlink_to(bench.file("outside.png", media.png(64, 64)))
@@ -173,12 +179,7 @@ def _options(bench: _Bench) -> None:
     from vipe_core.video import Limits
 
     for text in ("height", "height=-1", "height=tall", "depth=3", "depth=3@1,2", "width=2", "path=inf"):
-        bench.tried(
-            "options",
-            f"`--scale-from {text}`",
-            "invalid_config",
-            lambda text=text: KnownLength.parse(text),  # type: ignore[misc]
-        )
+        bench.tried("options", f"`--scale-from {text}`", "invalid_config", KnownLength.parse, text)
     bench.tried("options", "a preset that is not there", "invalid_config", lambda: Annotator(preset="magic"))
     bench.tried("options", "a camera that is not there", "invalid_config", lambda: Annotator(camera="periscope"))
     bench.tried("options", "a device that is not there", "invalid_config", lambda: Annotator(device="abacus"))
@@ -217,7 +218,7 @@ def _cameras(bench: _Bench) -> None:
     ]
     for what, name, content in files:
         path = bench.file(f"lenses/{name}", content)
-        bench.tried("cameras", what, "invalid_config", lambda path=path: read_calibration(path))  # type: ignore[misc]
+        bench.tried("cameras", what, "invalid_config", read_calibration, path)
     clip = bench.file("lenses/clip.mp4", media.clip(3))
     square = Calibration.from_json({**lens, "height": 96})
     speckles = np.random.default_rng(0).integers(0, 255, (8, 12, 3), dtype=np.uint8)
@@ -271,7 +272,7 @@ def _lists(bench: _Bench) -> None:
     ]
     for name, content, what, code in cases:
         path = bench.file(f"lists/{name}", content)
-        bench.tried("lists", what, code, lambda path=path: list(expand(str(path), rules)))  # type: ignore[misc]
+        bench.tried("lists", what, code, lambda at: list(expand(at, rules)), str(path))
 
 
 def _addresses(bench: _Bench) -> None:
@@ -303,7 +304,7 @@ def _addresses(bench: _Bench) -> None:
         ("http://media.example\\@other.example/", "a URL that two parsers read differently", "address_refused"),
         ("http://127.0.0.1:8080/v1/jobs", "the service's own address", "address_refused"),
     ):
-        bench.tried("addresses", what, code, lambda uri=uri: list(expand(uri, rules)))  # type: ignore[misc]
+        bench.tried("addresses", what, code, lambda at: list(expand(at, rules)), uri)
     everywhere = NetworkPolicy(("*:*",))
 
     def get(url: str) -> None:
@@ -319,7 +320,7 @@ def _addresses(bench: _Bench) -> None:
         ("http://100.64.0.1/", "an address shared by carriers"),
         ("http://[64:ff9b::7f00:1]/", "loopback behind a translator"),
     ):
-        bench.tried("addresses", what, "address_refused", lambda url=url: get(url))  # type: ignore[misc]
+        bench.tried("addresses", what, "address_refused", get, url)
 
 
 @contextlib.contextmanager
@@ -377,9 +378,13 @@ def _downloads(bench: _Bench) -> None:
                 "downloads",
                 what,
                 code,
-                lambda path=path, etag=etag: download(  # type: ignore[misc]
-                    http, url + path, bench.folder / "got", max_bytes=1000, etag=etag, sleep=lambda _: None
-                ),
+                download,
+                http,
+                url + path,
+                bench.folder / "got",
+                max_bytes=1000,
+                etag=etag,
+                sleep=lambda _: None,
             )
 
 
@@ -463,7 +468,8 @@ def _archives(bench: _Bench) -> None:
             "archives",
             what,
             "integrity_error",
-            lambda data=data: [f.read() for *_, f in read_members(io.BytesIO(data), "depth.tar")],  # type: ignore[misc]
+            lambda tar: [f.read() for *_, f in read_members(io.BytesIO(tar), "depth.tar")],
+            data,
         )
 
     def zipped(name: str, content: bytes, claimed: int | None = None) -> io.BytesIO:
@@ -490,7 +496,7 @@ def _archives(bench: _Bench) -> None:
         (zipped("00000.exr", b"no picture"), "a picture that is none"),
         (io.BytesIO(b"no zip"), "bytes that are no zip"),
     ):
-        bench.tried("archives", what, "format_error", lambda source=source: open_zip(source))  # type: ignore[misc]
+        bench.tried("archives", what, "format_error", open_zip, source)
     claimed = bytearray(depth)
     at = depth.index(b"dataWindow\0box2i\0") + len(b"dataWindow\0box2i\0") + 4
     claimed[at : at + 16] = struct.pack("<4i", 0, 0, 99_999, 99_999)
