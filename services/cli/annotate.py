@@ -169,11 +169,11 @@ def _show(rows: list[dict[str, Any]], output: Path, *, as_json: bool, stages: bo
     """Tables of what was done, and of what took how long unless rows share it; exit code 1 if anything failed."""
     done = [row for row in rows if "error" not in row]
     if done and not as_json:
-        from services.cli.tables import annotation_table, results_console, stage_table
+        from services.cli.tables import annotation_table, print_table, results_console, stage_table
 
-        results_console().print(annotation_table(done))
+        print_table(annotation_table(done))
         if stages:
-            results_console().print(stage_table(done))
+            print_table(stage_table(done))
         results_console().print(f"Written to {output.resolve()}", soft_wrap=True)
     if len(done) < len(rows):
         raise typer.Exit(1)

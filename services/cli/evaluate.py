@@ -231,7 +231,7 @@ def _show(title: str, headings: Sequence[str], rows: Sequence[Sequence[str]]) ->
     from rich.table import Table
     from rich.text import Text
 
-    from services.cli.tables import results_console
+    from services.cli.tables import print_table
 
     table = Table(title=Text(title), show_edge=False, pad_edge=False, header_style="bold")
     for number, heading in enumerate(headings):
@@ -239,5 +239,4 @@ def _show(title: str, headings: Sequence[str], rows: Sequence[Sequence[str]]) ->
         table.add_column(Text(heading), justify="left" if number == 0 else "right")
     for row in rows:
         table.add_row(*map(Text, row))
-    widest = [max(len(row[number]) for row in (headings, *rows)) for number in range(len(headings))]
-    results_console(sum(widest) + 3 * len(widest)).print(table)
+    print_table(table)

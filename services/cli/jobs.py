@@ -150,7 +150,7 @@ def list_jobs(limit: int = 20, api: ApiUrl = DEFAULT_API, api_key: ApiKey = None
     """List jobs, newest first."""
     from rich.table import Table
 
-    from services.cli.tables import results_console
+    from services.cli.tables import print_table
 
     found = _client(api, api_key).jobs(limit=limit)
     if as_json:
@@ -165,7 +165,7 @@ def list_jobs(limit: int = 20, api: ApiUrl = DEFAULT_API, api_key: ApiKey = None
         failed = progress["videos_failed"] + progress["videos_quarantined"]
         counts = (f"{settled}/{progress['videos_total']}", str(failed), str(progress["frames_done"]))
         table.add_row(job["id"], job["state"], *counts, job["created_at"], job["spec"]["output"])
-    results_console().print(table)
+    print_table(table)
 
 
 def status(job_id: str, api: ApiUrl = DEFAULT_API, api_key: ApiKey = None) -> None:
@@ -203,9 +203,9 @@ def videos(
         for video in found:
             sys.stdout.write(json.dumps(video) + "\n")
         return
-    from services.cli.tables import annotation_table, results_console
+    from services.cli.tables import annotation_table, print_table
 
-    results_console().print(annotation_table(video for video in found if video["status"] != "pending"))
+    print_table(annotation_table(video for video in found if video["status"] != "pending"))
 
 
 def cancel(job_id: str, api: ApiUrl = DEFAULT_API, api_key: ApiKey = None) -> None:

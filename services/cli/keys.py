@@ -55,7 +55,7 @@ def list_keys(
     """List API keys, without their secrets."""
     from rich.table import Table
 
-    from services.cli.tables import results_console
+    from services.cli.tables import print_table
 
     columns = ("id", "tenant", "name", "scopes", "created", "last used", "ends")
     table = Table(*columns, show_edge=False, header_style="bold")
@@ -69,7 +69,7 @@ def list_keys(
                 table.add_row(key.id, key.tenant, key.name, " ".join(sorted(key.scopes)), *times)
             if after is None:
                 break
-    results_console().print(table)
+    print_table(table)
 
 
 def revoke(

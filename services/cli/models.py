@@ -16,7 +16,7 @@ def list_models() -> None:
     """List weights: licence, size, which presets need them, and whether they are on this machine."""
     from rich.table import Table
 
-    from services.cli.tables import results_console
+    from services.cli.tables import print_table
     from vipe_core.pipeline.presets import PRESETS, resolve
     from vipe_core.priors.weights import WEIGHTS, path_of, record_of, selected, weights_folder
 
@@ -29,7 +29,7 @@ def list_models() -> None:
         sha256 = weights.sha256 or (f"{record.sha256} (of the first pull)" if record else "not published")
         here = "yes" if path_of(name).is_file() else "no"
         table.add_row(name, presets, weights.licence, f"{weights.size_bytes / 1e6:.0f}", here, sha256, weights.project)
-    results_console().print(table)
+    print_table(table)
     typer.echo(f"in {weights_folder()}")
 
 

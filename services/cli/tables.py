@@ -7,18 +7,27 @@ from collections.abc import Iterable, Mapping
 from typing import Any
 
 from rich.console import Console
+from rich.measure import Measurement
 from rich.table import Table
 from rich.text import Text
 
 _LOG_WIDTH = 140
+_ANY_WIDTH = 100_000
 _VERDICT_STYLE = {"yes": "green", "doubtful": "yellow", "no": "red"}
 
 
-def results_console(table_width: int = 0) -> Console:
-    """Standard output; a file or pipe is as wide as the widest table, so that nothing is cut off in a log."""
-    if sys.stdout.isatty():
-        return Console(highlight=False)
-    return Console(highlight=False, width=max(_LOG_WIDTH, table_width))
+def results_console() -> Console:
+    """Standard output; a file or pipe is wide, so that little is wrapped in a log."""
+    return Console(highlight=False, width=None if sys.stdout.isatty() else _LOG_WIDTH)
+
+
+def print_table(table: Table) -> None:
+    """To standard output; a file or pipe is as wide as the table, so that a row is a line."""
+    console = results_console()
+    if not sys.stdout.isatty():
+        unbounded = console.options.update(width=_ANY_WIDTH)
+        console.width = max(_LOG_WIDTH, Measurement.get(console, unbounded, table).maximum)
+    console.print(table)
 
 
 def _quality(quality: Mapping[str, Any] | None) -> Text:

@@ -17,7 +17,7 @@ def tenants(data_dir: DataDir = None, database_url: Database = None) -> None:
     """List the tenants: their limits, and what they use."""
     from rich.table import Table
 
-    from services.cli.tables import results_console
+    from services.cli.tables import print_table
 
     with open_store(settings_from(data_dir=data_dir, database_url=database_url)) as store:
         found = store.list_tenants()
@@ -34,7 +34,7 @@ def tenants(data_dir: DataDir = None, database_url: Database = None) -> None:
             f"{tenant.slot_seconds / 3600:.2f}",
             "its own" if tenant.own_limits else "of *",
         )
-    results_console().print(table)
+    print_table(table)
 
 
 def limit(

@@ -262,7 +262,8 @@ def test_the_command_lists_pulls_verifies_and_mirrors(web: Web, folder: Path, tm
 
     code, text = vipectl("list")
     assert code == 0
-    assert all(word in text for word in ("droid", "pose_only", "BSD-3-Clause", "not published"))
+    (droid,) = (line for line in text.splitlines() if line.startswith("droid "))
+    assert all(word in droid for word in ("pose_only", "BSD-3-Clause", "not published", "https://")), "a row is a line"
     assert "there are no weights in" in vipectl("verify")[1]
     code, text = vipectl("verify", "droid")
     assert code == 1
