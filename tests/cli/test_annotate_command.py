@@ -93,7 +93,7 @@ def test_what_is_not_offered_is_refused_with_what_is(
 
 
 @pytest.mark.long
-@pytest.mark.timeout(900)
+@pytest.mark.timeout(1800)
 def test_after_a_warmup_nothing_is_left_to_compile(
     vipectl: Run, clip: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -110,7 +110,7 @@ def test_after_a_warmup_nothing_is_left_to_compile(
     assert len(after) > 20
     assert vipectl("annotate", clip, "-o", "out").returncode == 0
     for preset in ("wide_angle", "panorama"):
-        done = vipectl("warmup", "--preset", preset)
+        done = vipectl("warmup", "--preset", preset, timeout_s=600)
         assert done.returncode == 0, done.stderr
         assert f"ready: {preset} on cpu" in done.stdout
     assert compiled() == after
