@@ -122,7 +122,7 @@ class Rig:
             scratch_dir=root / "scratch",
             engine="agent_engines:open_in_memory",
             lease_ttl_s=60.0,
-            **settings,  # type: ignore[arg-type]
+            **settings,
         )
         return cls(root, config, SqlStore(f"sqlite:///{root}/vipe.db"), shares)
 

@@ -265,7 +265,7 @@ def test_rubbish_goes_when_a_job_has_ended(world: World) -> None:
     assert world.ended(done) is JobState.SUCCEEDED
     for job_id in (done, failed):
         folder = Path(world.store.get_job(job_id).spec.output, "payload")
-        world.wait(lambda at=folder: not (at / "vipe-0badbeef" / "pose.tar").exists(), "the payload to go")  # type: ignore[misc]
+        world.wait(lambda at=folder: not (at / "vipe-0badbeef" / "pose.tar").exists(), "the payload to go")
         assert not (folder / ".vipe-tmp-1-2").exists()
     world.wait(lambda: world.store.next_unswept(quiet_s=0) is None, "both to be done with")
     assert len(list(Path(world.store.get_job(done).spec.output, "payload").glob("*/pose.tar"))) == 1
@@ -434,7 +434,7 @@ def test_a_stolen_lease_is_told_to_stop_and_a_closed_one_is_left_alone(tmp_path:
 
 
 def test_a_lost_lease_outranks_a_drain() -> None:
-    live = LiveLease(None, 0.0)  # type: ignore[arg-type]
+    live = LiveLease(None, 0.0)
     live.stop(StopReason.DRAINED)
     live.stop(StopReason.LOST)
     live.stop(StopReason.CANCELLED)

@@ -101,7 +101,7 @@ def test_what_was_decided_survives_whoever_decided_it(rig: Rig, monkeypatch: pyt
 def test_a_zombie_learns_what_counts_and_clears_up(rig: Rig) -> None:
     rig.job({"a": "frames=2"}, create_once=False)
     zombie = rig.lease()
-    rig.supervisor._committer = _Late(rig.committer)  # type: ignore[assignment]
+    rig.supervisor._committer = _Late(rig.committer)
     outcome = rig.supervisor.work(zombie)
     assert (outcome.kind, outcome.reason) == ("committed", "adopted")
     record = rig.record(zombie)
@@ -120,7 +120,7 @@ class _Late:
     def __getattr__(self, name: str) -> object:
         return getattr(self._committer, name)
 
-    def write(self, lease, payload):  # type: ignore[no-untyped-def]
+    def write(self, lease, payload):
         store, output = self._committer._store, self._committer.output(lease.spec.output)
         store.release(lease.shard_id, lease.fence, "expired")
         (taken,) = store.claim("other", limit=1, ttl_s=60)
@@ -132,8 +132,8 @@ class _Late:
         return self._committer.write(lease, payload)
 
 
-def _dies_on_records(put_bytes):  # type: ignore[no-untyped-def]
-    def put(self, key, data):  # type: ignore[no-untyped-def]
+def _dies_on_records(put_bytes):
+    def put(self, key, data):
         if key.startswith("_commits/"):
             raise KeyboardInterrupt
         return put_bytes(self, key, data)
@@ -150,12 +150,10 @@ def test_a_shard_that_joins_a_complete_plan_is_expected_before_its_record(rig: R
     ghost = PlannedShard(0, "0" * 64, ("gone",))
     publish_plan(output, job_id, live.lease.spec.config_hash, lambda first: [ghost][first:], 1)
     joined = replace(live.lease, ordinal=1)
-    rig.committer._store.planned_shards = (
-        lambda job, first_ordinal, limit: [  # type: ignore[method-assign]
-            PlannedShard(1, joined.plan_hash, ("a",))
-        ][first_ordinal - 1 :]
-    )
-    rig.committer._store.get_job = lambda job: replace(  # type: ignore[method-assign]
+    rig.committer._store.planned_shards = lambda job, first_ordinal, limit: [PlannedShard(1, joined.plan_hash, ("a",))][
+        first_ordinal - 1 :
+    ]
+    rig.committer._store.get_job = lambda job: replace(
         SqlStore.get_job(rig.store, job), progress=JobProgress(shards_total=2)
     )
     rig.committer._extend_plan(output, joined)

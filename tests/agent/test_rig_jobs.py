@@ -40,7 +40,7 @@ def submit(agent: Rig, scripts: dict[str, str], **options: object) -> str:
     (folder / "car.rig.json").write_text(json.dumps({"version": 1, "metric": True, "views": views}))
     (folder / "walk.mp4").write_text("frames=3")
     (folder / "list.csv").write_text(f"uri,key\n{folder}/car.rig.json,car\n{folder}/walk.mp4,walk\n")
-    spec = JobSpec((str(folder / "list.csv"),), str(agent.root / "out"), attributes=("pose", "intrinsics"), **options)  # type: ignore[arg-type]
+    spec = JobSpec((str(folder / "list.csv"),), str(agent.root / "out"), attributes=("pose", "intrinsics"), **options)
     job, _ = agent.store.create_job(spec)
     assert plan_next(agent.store, "planner")
     return job.id

@@ -302,7 +302,7 @@ def test_an_input_that_can_never_be_fetched_becomes_a_row_in_the_end(
     def unreachable(uri: str, **options: object) -> object:
         if uri.startswith("s3://"):
             raise error(f"{uri} is out of reach")
-        return open_store(uri, **options)  # type: ignore[arg-type]
+        return open_store(uri, **options)
 
     monkeypatch.setattr("services.agent.slot.open_store", unreachable)
     rig = Rig.make(tmp_path, max_give_backs=2, storage_tries=2)

@@ -185,7 +185,7 @@ class TestKeys:
     def test_wrong_keys(self, world: World, wrong: str | None) -> None:
         with world.http(None) as http:
             headers = {} if wrong is None else {"Authorization": wrong.encode("latin-1")}
-            answer = http.get("/v1/jobs", headers=headers)  # type: ignore[arg-type]
+            answer = http.get("/v1/jobs", headers=headers)
             detail = assert_problem(answer, 401, "unauthorized")["detail"]
             assert answer.headers["www-authenticate"] == "Bearer"
             assert "***" not in detail, "advice is not taken for a secret"

@@ -21,7 +21,7 @@ KERNELS = ["huber", "cauchy", "geman_mcclure", "tukey", "truncated"]
 @given(st.sampled_from(KERNELS), st.floats(0.1, 10.0), st.floats(0.1, 1.0), st.floats(1e-3, 300.0))
 def test_slope_is_the_derivative_of_the_cost(kernel: RobustKernel, scale_px: float, end: float, squared: float) -> None:
     s = torch.tensor(squared, dtype=torch.float64, requires_grad=True)
-    robust.cost(kernel, scale_px, s, end * scale_px).backward()  # type: ignore[no-untyped-call]
+    robust.cost(kernel, scale_px, s, end * scale_px).backward()
     root = robust.root_slope(kernel, scale_px, s.detach(), end * scale_px)
     assert s.grad is not None
     assert root is not None

@@ -137,7 +137,7 @@ def test_a_published_data_set_reads_the_same(tmp_path: Path) -> None:
 def _retar(change: Callable[[list[tuple[str, bytes]]], list[tuple[str, bytes]]]) -> Callable[[bytes], bytes]:
     def edit(data: bytes) -> bytes:
         with tarfile.open(fileobj=io.BytesIO(data)) as tar:
-            members = [(m.name, tar.extractfile(m).read()) for m in tar]  # type: ignore[union-attr]
+            members = [(m.name, tar.extractfile(m).read()) for m in tar]
         out = io.BytesIO()
         with tarfile.open(fileobj=out, mode="w") as tar:
             for name, content in change(members):

@@ -109,7 +109,7 @@ def test_tiny_clips_do_what_their_name_says(kind: ClipKind) -> None:
 
 def test_unknown_clip_is_refused() -> None:
     with pytest.raises(ConfigError, match="known: static"):
-        tiny_clip("sliding")  # type: ignore[arg-type]
+        tiny_clip("sliding")
 
 
 def test_a_rig_moves_as_one_body() -> None:

@@ -151,7 +151,7 @@ def test_attributes_and_progress(tmp_path: Path) -> None:
     assert calls == [(index, 7) for index in range(1, 8)]
     assert json.loads(paths.info.read_text())["attributes"] == ["pose", "depth"]
     with pytest.raises(ValueError, match="unknown attributes"):
-        write_artifacts(make_annotation(), tmp_path, attributes=("flow",))  # type: ignore[arg-type]
+        write_artifacts(make_annotation(), tmp_path, attributes=("flow",))
 
 
 def test_a_failure_leaves_nothing_and_keeps_an_earlier_result(tmp_path: Path) -> None:

@@ -81,7 +81,7 @@ def test_an_absurd_size(tmp_path: Path) -> None:
 @pytest.mark.parametrize("mode", ["w:gz", "w:xz", "w:bz2"])
 def test_compressed_tars_are_not_unpacked(tmp_path: Path, mode: str) -> None:
     buffer = io.BytesIO()
-    with tarfile.open(fileobj=buffer, mode=mode) as tar:  # type: ignore[call-overload]
+    with tarfile.open(fileobj=buffer, mode=mode) as tar:
         tar.addfile(member("a.npz", size=1 << 20), io.BytesIO(bytes(1 << 20)))
     refused(buffer.getvalue(), tmp_path)
 

@@ -150,7 +150,7 @@ def test_look(http: GuardedHttp, web: Web) -> None:
 
 
 def rules(**changes: object) -> InputRules:
-    return InputRules(network=LOCAL, **changes)  # type: ignore[arg-type]
+    return InputRules(network=LOCAL, **changes)
 
 
 def read(ref: VideoRef, allowed: InputRules, folder: Path) -> bytes:

@@ -62,7 +62,7 @@ def test_a_starting_point_is_refined() -> None:
 
 @pytest.mark.parametrize("model", ["opencv", "opencv_fisheye"])
 def test_outputs_of_a_distorted_lens_are_for_its_own_pixels(model: str, tmp_path: Path) -> None:
-    lens = sample_camera(model, 160, 120)  # type: ignore[arg-type]
+    lens = sample_camera(model, 160, 120)
     clip = clip_of(lens)
     masked = np.zeros(clip.rgb.shape[:3], np.bool_)
     masked[:, 20:40, 30:60] = True
@@ -81,7 +81,7 @@ def test_outputs_of_a_distorted_lens_are_for_its_own_pixels(model: str, tmp_path
     assert np.median(np.abs(scale * frame.depth[there] / truth[there] - 1)) < 0.04
     provenance = found.provenance.calibration
     assert provenance is not None
-    assert provenance["resampled_to"]["model"] == ("pinhole" if model == "opencv" else "mei")  # type: ignore[index]
+    assert provenance["resampled_to"]["model"] == ("pinhole" if model == "opencv" else "mei")
     write_artifacts(found, tmp_path, attributes=("pose", "intrinsics"))
     assert read_artifacts(tmp_path, "clip").camera == lens
 

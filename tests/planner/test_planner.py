@@ -211,7 +211,7 @@ class TestJobs:
         class DyingStore(SqlStore):
             left = batches
 
-            def add_shards(self, job_id, fence, shards, *, ttl_s):  # type: ignore[no-untyped-def]
+            def add_shards(self, job_id, fence, shards, *, ttl_s):
                 if self.left == 0:
                     raise Crash
                 self.left -= 1
@@ -241,14 +241,14 @@ class TestJobs:
         class SecondStore(SqlStore):
             left = 3
 
-            def add_shards(self, job_id, fence, shards, *, ttl_s):  # type: ignore[no-untyped-def]
+            def add_shards(self, job_id, fence, shards, *, ttl_s):
                 if self.left == 0:
                     raise Crash
                 self.left -= 1
                 return super().add_shards(job_id, fence, shards, ttl_s=ttl_s)
 
         class SleepyStore(SqlStore):
-            def add_shards(self, job_id, fence, shards, *, ttl_s):  # type: ignore[no-untyped-def]
+            def add_shards(self, job_id, fence, shards, *, ttl_s):
                 second = SecondStore(f"sqlite:///{tmp_path}/store.db")
                 with pytest.raises(Crash):
                     plan_next(second, "second", ttl_s=60)
@@ -389,7 +389,7 @@ class TestJobs:
         job_id = submit(store, tmp_path / "out", videos)
 
         class CancellingStore(SqlStore):
-            def add_shards(self, job_id, fence, shards, *, ttl_s):  # type: ignore[no-untyped-def]
+            def add_shards(self, job_id, fence, shards, *, ttl_s):
                 self.request_cancel(job_id)
                 return super().add_shards(job_id, fence, shards, ttl_s=ttl_s)
 

@@ -40,7 +40,7 @@ class World:
         index = shown(rgb)
         self.looks.append(index)
         return [
-            Detection(tuple(map(float, box)), 0.9 - 0.1 * number, self.phrases[name])  # type: ignore[arg-type]
+            Detection(tuple(map(float, box)), 0.9 - 0.1 * number, self.phrases[name])
             for number, (name, box) in enumerate(self.things[index].items())
             if self.phrases[name] in phrases
         ]

@@ -197,7 +197,7 @@ class Slanted:
 def test_a_bent_camera_is_seen_as_a_pinhole_and_z_goes_back_along_the_rays() -> None:
     bent = Camera("mei", (60.0, 60.0, 32.0, 24.0, 0.8), 64, 48)
     assert nearest_pinhole(bent).focal_px == pytest.approx(60 / 1.8, rel=1e-4)
-    found = Rectified(Slanted()).estimate(picture(), bent)  # type: ignore[arg-type]
+    found = Rectified(Slanted()).estimate(picture(), bent)
     rays = bent.rays()
     expected = (1 + rays[..., 0] / rays[..., 2]).clip(0.1)
     known = found.depth_m > 0
@@ -206,7 +206,7 @@ def test_a_bent_camera_is_seen_as_a_pinhole_and_z_goes_back_along_the_rays() -> 
     np.testing.assert_allclose(found.depth_m[known], expected[known], atol=0.6 / nearest_pinhole(bent).focal_px)
     assert not found.confidence[~known].any()
     with pytest.raises(ConfigError, match="panorama"):
-        Rectified(Slanted()).estimate(picture(), Camera("equirect", (), 64, 32))  # type: ignore[arg-type]
+        Rectified(Slanted()).estimate(picture(), Camera("equirect", (), 64, 32))
 
 
 def test_a_missing_package_names_what_installs_it() -> None:

@@ -35,7 +35,7 @@ def good_map(**changes: float) -> MapReport:
         keyframe_inlier_ratio=each,
         keyframe_coverage=each,
     )
-    return replace(report, **changes)  # type: ignore[arg-type]
+    return replace(report, **changes)
 
 
 def posed(interpolated: int = 0) -> Trajectory:
@@ -63,7 +63,7 @@ def good(**changes: object) -> SlamResult:
         loops=LoopReport(3, 2.0, 0.5, 0.01),
         timings_s={},
     )
-    return replace(result, **changes)  # type: ignore[arg-type]
+    return replace(result, **changes)
 
 
 def verdict(result: SlamResult) -> Quality:

@@ -35,7 +35,7 @@ class ExactRig(ExactScene):
         self.rig_from_world, self.cam_from_rig = rig_from_world, cam_from_rig
         self.num_views = len(cam_from_rig)
         poses = (cam_from_rig[None] @ rig_from_world[:, None]).reshape(-1, 4, 4)
-        super().__init__(poses, **kwargs)  # type: ignore[arg-type]
+        super().__init__(poses, **kwargs)
 
     def encode(self, frame: WorkingFrame) -> int:
         return frame.index * self.num_views + int(frame.rgb[0, 0, 0])

@@ -150,7 +150,7 @@ class Ruler:
 
 
 def select(positions: Sequence[float], **settings: object) -> Selection:
-    chosen = SlamSettings(**settings)  # type: ignore[arg-type]
+    chosen = SlamSettings(**settings)
     return select_keyframes(encoded(Ruler(positions)), SIZE, chosen, lambda *_: None)
 
 

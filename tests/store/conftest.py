@@ -56,7 +56,7 @@ def postgres_url() -> Iterator[str]:
         check=True,
         cwd=folder,
         stdout=subprocess.DEVNULL,
-        **account,  # type: ignore[call-overload]
+        **account,
     )
     with (folder / "log").open("wb") as log:
         server = subprocess.Popen(
@@ -64,7 +64,7 @@ def postgres_url() -> Iterator[str]:
             cwd=folder,
             stdout=log,
             stderr=log,
-            **account,  # type: ignore[call-overload]
+            **account,
         )
     try:
         while (

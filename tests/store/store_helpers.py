@@ -8,7 +8,7 @@ from services.store.base import Store
 
 
 def spec(output: str = "/out", **changes: object) -> JobSpec:
-    return JobSpec(**{"inputs": ("/in",), "output": output, **changes})  # type: ignore[arg-type]
+    return JobSpec(**{"inputs": ("/in",), "output": output, **changes})
 
 
 def plans(number: int, videos_each: int = 2) -> list[ShardPlan]:

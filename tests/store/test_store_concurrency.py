@@ -204,9 +204,9 @@ def test_cancelling_while_agents_claim(store: SqlStore) -> None:
         job_id = planned_job(store, 8, videos_each=1, output=f"/out{round_number}")
         claimed: list[Lease] = []
         at_once(
-            lambda mine=claimed: mine.extend(store.claim("a", limit=4, ttl_s=600)),  # type: ignore[misc]
-            lambda mine=claimed: mine.extend(store.claim("b", limit=4, ttl_s=600)),  # type: ignore[misc]
-            lambda job_id=job_id: store.request_cancel(job_id),  # type: ignore[misc]
+            lambda mine=claimed: mine.extend(store.claim("a", limit=4, ttl_s=600)),
+            lambda mine=claimed: mine.extend(store.claim("b", limit=4, ttl_s=600)),
+            lambda job_id=job_id: store.request_cancel(job_id),
         )
         assert store.claim("c", limit=9, ttl_s=600) == []
         for lease in claimed:

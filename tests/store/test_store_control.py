@@ -53,7 +53,7 @@ def earlier(store_url: str, job_id: str, seconds: float) -> Iterator[None]:
             moved = {name: getattr(row, name) - by for name in ("leased_at", "committed_at") if getattr(row, name)}
             if moved:
                 database.write(
-                    lambda tx, row=row, moved=moved: tx.run(  # type: ignore[misc]
+                    lambda tx, row=row, moved=moved: tx.run(
                         update(schema.shards).where(shards.id == row.id).values(**moved)
                     )
                 )

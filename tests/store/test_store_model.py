@@ -77,7 +77,7 @@ class LeaseProtocol(RuleBasedStateMachine):
             self.job = JobState.CANCELLED
 
     @rule(target=leases, holder=st.sampled_from(HOLDERS), limit=st.integers(0, SHARDS))
-    def claim(self, holder: str, limit: int):  # type: ignore[no-untyped-def]
+    def claim(self, holder: str, limit: int):
         got = self.store.claim(holder, limit=limit, ttl_s=600)
         pending = [i for i, s in enumerate(self.shards) if s.state is ShardState.PENDING]
         expected = pending[:limit] if self.job is JobState.RUNNING else []
