@@ -164,16 +164,16 @@ def _with_tracks(problem: Problem, start: State, most: int) -> tuple[Problem, St
     return replace(problem, grid=points, edges=edges, priors=prior), state
 
 
-def _shapes() -> list[tuple[Problem, State, RobustKernel]]:
+def _shapes() -> list[tuple[Problem, State, Options]]:
     """Both cameras, all sets of intrinsics and kernels, odd numbers of cells, a frame with many edges, tracks, rigs."""
     kernels: tuple[RobustKernel, ...] = ("none", "huber", "cauchy", "geman_mcclure", "tukey", "truncated")
     shapes = [(4, (5, 13), 2), (6, (9, 15), 3), (9, (16, 20), 4), (3, (1, 7), 2), (27, (3, 5), 26)]
-    found: list[tuple[Problem, State, RobustKernel]] = []
+    found: list[tuple[Problem, State, Options]] = []
     for k, (frames, cells, reach) in enumerate(shapes):
         for unified in (False, True):
             for focal in (False, True):
                 problem, start = _scene(frames, cells, unified, focal, reach)
-                found.append((problem, start, kernels[(k + 2 * unified + focal) % len(kernels)]))
+                found.append((problem, start, Options(robust=kernels[(k + 2 * unified + focal) % len(kernels)])))
     rigs: tuple[tuple[bool, bool, bool, RobustKernel], ...] = (
         (False, True, False, "none"),
         (True, False, False, "geman_mcclure"),
@@ -183,8 +183,12 @@ def _shapes() -> list[tuple[Problem, State, RobustKernel]]:
     for unified in (False, True):
         for focal, cells, most in ((False, (5, 13), 200), (True, (3, 5), 9)):
             problem, start = _with_tracks(*_scene(5, cells, unified, focal, 3), most)
-            found.append((problem, start, "geman_mcclure" if focal else "none"))
-    return [*found, *((*_rig_scene(*kind), robust) for *kind, robust in rigs)]
+            found.append((problem, start, Options(robust="geman_mcclure" if focal else "none")))
+    for robust in kernels:
+        problem, start = _scene(4, (5, 13), True, True, 2)
+        problem = replace(problem, free=replace(problem.free, distortion=False))
+        found.append((problem, start, Options(robust=robust, componentwise=True)))
+    return [*found, *((*_rig_scene(*kind), Options(robust=robust)) for *kind, robust in rigs)]
 
 
 def _same(first: Result, second: Result) -> bool:
@@ -224,8 +228,8 @@ def check_compile() -> str:
 
 def check_correct() -> str:
     worst = {"pose": 0.0, "depth": 0.0, "descent": 0.0}
-    for problem, start, robust in _shapes():
-        options = Options(max_iterations=1, robust=robust, robust_scale_px=4.0, initial_damping=1e-3)
+    for problem, start, how in _shapes():
+        options = replace(how, max_iterations=1, robust_scale_px=4.0, initial_damping=1e-3)
         here = _moved(problem, start, _device())
         found = _kernels(*here, options)
         if len(problem.free.poses) * problem.grid.num_cells < 2000:
@@ -323,9 +327,10 @@ def check_one_wait() -> str:
 def check_small_solves() -> str:
     """What compute-sanitizer watches: one solve of every kind of kernel, on shapes that fill nothing evenly."""
     shapes = _shapes()
-    # Both cameras with and without free intrinsics, a frame with more edges than fit shared memory, rigs.
-    for problem, start, robust in [*shapes[:4], shapes[17], *shapes[-4:]]:
-        _kernels(*_moved(problem, start, _device()), Options(max_iterations=2, robust=robust, robust_scale_px=4.0))
+    # Both cameras with and without free intrinsics, a frame with more edges than fit shared memory, tracks beside the
+    # cells, components judged each for itself, rigs.
+    for problem, start, how in [*shapes[:4], shapes[17], *shapes[20:22], shapes[25], *shapes[-4:]]:
+        _kernels(*_moved(problem, start, _device()), replace(how, max_iterations=2, robust_scale_px=4.0))
     return "done"
 
 

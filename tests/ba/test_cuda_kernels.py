@@ -24,6 +24,7 @@ from vipe_core.ba.cuda import layout
 from vipe_core.ba.cuda import solver as cuda_solver
 from vipe_core.ba.cuda.compiler import Specialisation
 from vipe_core.ba.cuda.context import Context
+from vipe_core.ba.problem import RobustKernel
 from vipe_core.cameras import CameraModel
 from vipe_core.geometry import se3
 
@@ -40,9 +41,10 @@ KINDS = (
     Specialisation(True, True, True, "geman_mcclure", apart=True),
     Specialisation(False, True, False, "geman_mcclure", points=True),
     Specialisation(True, True, True, "cauchy", points=True),
+    Specialisation(True, True, False, "componentwise"),
 )
-PLAIN, FOCAL, TRUNCATED, POINTS = KINDS[0], KINDS[1], KINDS[6], KINDS[9]
-ALONE = [kind for kind in KINDS if not kind.apart]
+PLAIN, FOCAL, TRUNCATED, POINTS, COMPONENTS = KINDS[0], KINDS[1], KINDS[6], KINDS[9], KINDS[11]
+ALONE = [kind for kind in KINDS[:11] if not kind.apart]
 APART = [kind for kind in KINDS if kind.apart]
 
 pytestmark = pytest.mark.skipif(COMPILER is None, reason="no C++ compiler to run the kernels with")
@@ -435,6 +437,24 @@ def test_narrowing_kernels(first: float, iterations: int, kind: Specialisation) 
     assert_close(emulated(problem, start, options), solve(problem, start, options), rtol=1e-3)
 
 
+@pytest.mark.parametrize("robust", ["none", "huber", "cauchy", "geman_mcclure", "tukey", "truncated"])
+def test_components_are_judged_each_for_itself(robust: RobustKernel) -> None:
+    problem, truth = problem_of(COMPONENTS, num_frames=4, height=5, width=6)
+    problem = with_depth_prior(with_noise(problem, 0.3), truth.inverse_depth, 1.0)
+    start = disturbed(truth, twist=0.005, depth=0.02, log_focal=0.01)
+    options = Options(1, robust=robust, componentwise=True, robust_scale_px=2.0, initial_damping=1e-3)
+    step = oracle.newton_step(problem, start, options, options.initial_damping)
+    result = emulated(*float32(problem, start), options)
+    moved = se3.log(result.state.cam_from_world @ se3.inverse(start.cam_from_world))
+    assert (moved - step.pose).norm() < 1e-3 * step.pose.norm()
+    change = result.state.inverse_depth.double() - start.inverse_depth
+    assert (change - step.inverse_depth).norm() < 1e-3 * step.inverse_depth.norm()
+    # Lost measurements and graduation included.
+    problem, start = float32(problem, disturbed(truth, twist=0.03, log_focal=0.05))
+    options = replace(options, max_iterations=8, initial_scale_px=math.inf, relative_tolerance=1e-3)
+    assert_close(emulated(problem, start, options), solve(problem, start, options), rtol=1e-3)
+
+
 def test_exact_measurements_end() -> None:
     problem, truth = problem_of(PLAIN, num_frames=3, height=3, width=4)
     problem, start = float32(problem, truth)
@@ -481,14 +501,9 @@ def test_nothing_to_do() -> None:
 
 def test_what_a_gpu_is_checked_with_holds_here(monkeypatch: pytest.MonkeyPatch) -> None:
     """The comparison of `benchmarks.gpu_checks`, on those of its shapes that the kernels here are compiled for."""
-    shapes = [
-        (problem, start, robust)
-        for problem, start, robust in gpu_checks._shapes()
-        if cuda_solver.specialisation(problem, start, Options(robust=robust)) in KINDS
-    ]
+    shapes = [case for case in gpu_checks._shapes() if cuda_solver.specialisation(*case) in KINDS]
     assert all(
-        any(cuda_solver.specialisation(*case[:2], Options(robust=case[2])) == kind for case in shapes)
-        for kind in (*APART, POINTS)
+        any(cuda_solver.specialisation(*case) == kind for case in shapes) for kind in (*APART, POINTS, COMPONENTS)
     )
     small = [min(shapes, key=lambda case: case[1].inverse_depth.numel()), shapes[-1]]
     monkeypatch.setattr(gpu_checks, "_shapes", lambda: small)

@@ -8,8 +8,10 @@ import pytest
 import torch
 from ba_scenes import disturbed, float32, scene, with_depth_prior, with_noise
 
-from vipe_core.ba import Edges, Free, Options, Priors, Problem, State, Step, newton_step, oracle
+from vipe_core.ba import Edges, Free, Options, Priors, Problem, State, Step, newton_step, oracle, residuals
+from vipe_core.ba.host_solver import HostSolver
 from vipe_core.ba.problem import RobustKernel
+from vipe_core.ba.robust import cost as robust_cost
 from vipe_core.ba.torch_solver import TorchSolver
 from vipe_core.cameras import CameraModel
 
@@ -48,6 +50,37 @@ def test_step_equals_the_dense_oracle(camera_model: CameraModel, robust: RobustK
     expected = oracle.newton_step(problem, state, options, damping)
     assert_same_step(newton_step(problem, state, options, damping), expected, 1e-10)
     assert_same_step(torch_step(problem, state, options, damping), expected, 1e-10)
+
+
+@pytest.mark.parametrize("robust", ["none", "huber", "cauchy", "geman_mcclure", "tukey", "truncated"])
+@pytest.mark.parametrize("camera_model", ["pinhole", "mei"])
+def test_components_are_judged_each_for_itself(camera_model: CameraModel, robust: RobustKernel) -> None:
+    problem, state = small_problem(camera_model, distortion_free=camera_model == "mei")
+    options = Options(robust=robust, componentwise=True, robust_scale_px=0.3)
+    expected = oracle.newton_step(problem, state, options, 1e-3)
+    assert_same_step(newton_step(problem, state, options, 1e-3), expected, 1e-10)
+    assert_same_step(torch_step(problem, state, options, 1e-3), expected, 1e-10)
+    of_norm = newton_step(problem, state, replace(options, componentwise=False), 1e-3)
+    assert (relative_error(of_norm.pose, expected.pose) > 1e-3) is (robust != "none")
+    # The cost is rho, not the weights that stand for it.
+    error, valid = residuals(problem, state)
+    judged = robust_cost(robust, 0.3, error.square()) * problem.edges.weight * valid[..., None]
+    for kind in (HostSolver, TorchSolver):
+        cost = kind(problem, options, state).cost(state, 0.3)
+        assert float(cost.measurements) == pytest.approx(float(judged.sum()), rel=1e-9)
+        assert float(cost.weight) == pytest.approx(float((problem.edges.weight.amax(-1) * valid).sum()), rel=1e-9)
+
+
+@pytest.mark.parametrize("robust", ["cauchy", "truncated"])
+def test_with_one_component_the_norm_is_it(robust: RobustKernel) -> None:
+    problem, state = small_problem("pinhole")
+    weight = problem.edges.weight.clone()
+    weight[::2, :, 0] = 0
+    weight[1::2, :, 1] = 0
+    problem = replace(problem, edges=replace(problem.edges, weight=weight))
+    options = Options(robust=robust, robust_scale_px=0.3)
+    apart = newton_step(problem, state, replace(options, componentwise=True), 1e-3)
+    assert_same_step(apart, newton_step(problem, state, options, 1e-3), 1e-10)
 
 
 @pytest.mark.parametrize("camera_model", ["pinhole", "mei"])

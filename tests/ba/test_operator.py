@@ -50,6 +50,7 @@ def test_what_is_asked_arrives(case: Any, monkeypatch: pytest.MonkeyPatch) -> No
         max_iterations=3,
         relative_tolerance=1e-3,
         robust="cauchy",
+        componentwise=True,
         robust_scale_px=2.0,
         initial_scale_px=math.inf,
         initial_damping=1e-3,

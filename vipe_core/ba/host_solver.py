@@ -11,14 +11,13 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from vipe_core.ba import block_cholesky, kernels, robust
+from vipe_core.ba.kernel_inputs import Array, DepthPrior, Graph, Pose, Robust
 from vipe_core.ba.problem import Options, Points, Problem, State
 from vipe_core.ba.reduced import add_frames, add_twists, damp
 from vipe_core.ba.reprojection import cameras_of, median_inverse_depth, rays_of
@@ -27,8 +26,6 @@ from vipe_core.ba.rules import ALPHA_RANGE, MAX_LOG_FOCAL_STEP
 from vipe_core.ba.solver import Cost, Step
 from vipe_core.cameras import projection
 from vipe_core.geometry import se3
-
-Array = NDArray[Any]
 
 # Less work than this many edge cells is not worth waking another thread for.
 _CELLS_PER_THREAD = 1 << 16
@@ -54,7 +51,7 @@ class HostSystem:
     eliminated: Array
     direct_gradient: Array
     eliminated_gradient: Array
-    pose: kernels.Pose
+    pose: Pose
     adjoint: Array
     state: State
     scale: Array
@@ -82,7 +79,7 @@ class HostSolver:
         self._camera_of = camera_of
         grid = problem.grid
         real = grid.count.cpu() if isinstance(grid, Points) else torch.full((num_frames,), grid.num_cells)
-        self._graph = kernels.Graph(
+        self._graph = Graph(
             first=first,
             edge=order.numpy(),
             target_px=_flat(edges.target_px, dtype),
@@ -116,10 +113,10 @@ class HostSolver:
         self._pose_place, self._view_place = place[self._pose_of], place[self._number_of_view]
         self._per_frame = None if problem.rig is None else self._structure_of_frames()
 
-        self._kernel = robust.CODE[options.robust]
+        self._kernel = Robust(robust.CODE[options.robust], options.componentwise)
         self._sample_px = problem.grid.sample_px()
         self._rays: tuple[Tensor, Array, Array, Array] | None = None
-        self._seen: tuple[State, kernels.Pose, Tensor] | None = None
+        self._seen: tuple[State, Pose, Tensor] | None = None
         median = median_inverse_depth(grid, state.inverse_depth)
         self._depth_range = (options.min_inverse_depth * median, options.max_inverse_depth * median)
         held = torch.from_numpy(~depth_free)
@@ -127,12 +124,12 @@ class HostSolver:
         cells = len(self._source) * grid.num_cells
         self._threads = max(1, min(torch.get_num_threads(), cells // _CELLS_PER_THREAD))
 
-    def _depth_prior(self, dtype: torch.dtype) -> kernels.DepthPrior:
+    def _depth_prior(self, dtype: torch.dtype) -> DepthPrior:
         priors = self.problem.priors
         if priors.inverse_depth is None or priors.inverse_depth_weight is None:
             nothing = torch.empty(0, self.problem.grid.num_cells, dtype=dtype).numpy()
-            return kernels.DepthPrior(nothing, nothing)
-        return kernels.DepthPrior(
+            return DepthPrior(nothing, nothing)
+        return DepthPrior(
             priors.inverse_depth.to(dtype).contiguous().numpy(),
             priors.inverse_depth_weight.to(dtype).contiguous().numpy(),
         )
@@ -181,7 +178,7 @@ class HostSolver:
 
     # -- state -----------------------------------------------------------------------------------------------------
 
-    def _pose(self, state: State) -> tuple[kernels.Pose, Tensor]:
+    def _pose(self, state: State) -> tuple[Pose, Tensor]:
         """What the kernels need of a state, and the transforms of the edges. The last one is kept.
 
         An accepted state is judged first and linearised next.
@@ -190,7 +187,7 @@ class HostSolver:
             self._seen = (state, *self._see(state))
         return self._seen[1:]
 
-    def _see(self, state: State) -> tuple[kernels.Pose, Tensor]:
+    def _see(self, state: State) -> tuple[Pose, Tensor]:
         model, intrinsics = self.problem.camera_model, state.intrinsics.reshape(self._num_cameras, -1)
         transform = se3.relative(state.cam_from_world[self._target], state.cam_from_world[self._source])
         if self._rays is None or not torch.equal(self._rays[0], intrinsics):
@@ -203,7 +200,7 @@ class HostSolver:
         cameras = torch.zeros(self._num_cameras, 5, dtype=self._dtype)
         cameras[:, : intrinsics.shape[1]] = intrinsics
         return (
-            kernels.Pose(
+            Pose(
                 transform=transform[:, :3].flatten(1).to(self._dtype).contiguous().numpy(),
                 rays=self._rays[1],
                 rays_by_intrinsics=self._rays[2],

@@ -14,14 +14,12 @@ distances are the ones that compile to vector code.
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from vipe_core.ba.kernel_inputs import Array, DepthPrior, Graph, Pose, Robust
 from vipe_core.compilation import vectorised
-
-Array = NDArray[Any]
 
 TILE = 256
 # Rows of an edge: 6 of its twist, log f, alpha, negative residual; where its two cameras have intrinsics of their own,
@@ -31,9 +29,10 @@ ROWS, ROWS_APART = 9, 12
 TAIL = 3
 
 # Rows of the view buffer: homogeneous point, 1 / s, projection before focal length and centre, |X|, weighted residual,
-# roots of the weights, argument of the robust kernel, larger weight. Zero weights where the point is not imaged.
-_X, _Y, _Z, _INV, _PX, _PY, _NORM, _EU, _EV, _SU, _SV, _SQ, _WM = (k * TILE for k in range(13))
-_VIEW_SIZE = 13 * TILE
+# roots of the weights, argument of the robust kernel, larger weight; componentwise, the kernel's arguments by component
+# and the weights. Zero weights where the point is not imaged.
+_X, _Y, _Z, _INV, _PX, _PY, _NORM, _EU, _EV, _SU, _SV, _SQ, _WM, _QU, _QV, _WU, _WV = (k * TILE for k in range(17))
+_VIEW_SIZE = 17 * TILE
 # Least positive number that is not denormal in single precision.
 _TINY = 1.2e-38
 # Rows of the Jacobian buffer: ROWS_APART pairs (u, v), then the derivative by inverse depth, then J_X.
@@ -42,45 +41,6 @@ _OF_TARGET = 18 * TILE
 _BY_DEPTH = 24 * TILE
 _BY_POINT = 26 * TILE
 _JACOBIAN_SIZE = 32 * TILE
-
-
-class Graph(NamedTuple):
-    """Edges in order of (source, target): `edge` (E,) numbers the problem's, those of frame i are first[i]:first[i+1].
-
-    target_px and weight are (E, 2 P) in the problem's order, (u, v) alternating; depth_free (N,) bool; num_cells (N,)
-    at most P. Which rays and intrinsics are meant say table (N,), source_camera (N,) and, in order, target_camera (E,).
-    """
-
-    first: Array
-    edge: Array
-    target_px: Array
-    weight: Array
-    depth_free: Array
-    num_cells: Array
-    table: Array
-    source_camera: Array
-    target_camera: Array
-
-
-class Pose(NamedTuple):
-    """A state: transform (E, 12) rows of [R | t] in order, rays (T, 3, P), their derivatives (T, 2, 3, P).
-
-    min_s (T, P), inverse_depth (N, P), camera (C, 5) with (fx, fy, cx, cy, alpha), all of one dtype.
-    """
-
-    transform: Array
-    rays: Array
-    rays_by_intrinsics: Array
-    min_s: Array
-    inverse_depth: Array
-    camera: Array
-
-
-class DepthPrior(NamedTuple):
-    """Value and information, (N, P), or (0, P) without a prior."""
-
-    value: Array
-    weight: Array
 
 
 @vectorised
@@ -130,13 +90,11 @@ def _see(graph: Graph, pose: Pose, frame: int, order: int, start: int, n: int, v
 
 
 @vectorised
-def _rho_sum(kernel: int, scale: Array, view: Array, n: int) -> tuple[float, float]:
-    """Sums of wmax rho(s) and of wmax over a tile."""
-    squared, weight, c2 = view[_SQ : _SQ + TILE], view[_WM : _WM + TILE], scale[0]
-    zero, one, two = view.dtype.type(0), view.dtype.type(1), view.dtype.type(2)
-    total, kept = zero, zero
-    for p in range(n):
-        kept += weight[p]
+def _rho_sum(kernel: int, scale: Array, squared: Array, weight: Array, n: int) -> Any:
+    """Sum of weight rho(squared) over a tile."""
+    c2 = scale[0]
+    zero, one, two = weight.dtype.type(0), weight.dtype.type(1), weight.dtype.type(2)
+    total = zero
     if kernel == 0:
         for p in range(n):
             total += weight[p] * squared[p]
@@ -152,30 +110,50 @@ def _rho_sum(kernel: int, scale: Array, view: Array, n: int) -> tuple[float, flo
         for p in range(n):
             total += weight[p] * (squared[p] * c2 / (c2 + squared[p]))
     elif kernel == 4:
-        third = c2 / view.dtype.type(3)
+        third = c2 / weight.dtype.type(3)
         for p in range(n):
             s = squared[p]
             inside = one - s / c2 if s < c2 else s - s
             total += weight[p] * third * (one - inside * inside * inside)
     else:
         c, final2 = math.sqrt(c2), scale[1]
-        wide, least = max(c2 - final2, view.dtype.type(_TINY)), final2 / c2
+        wide, least = max(c2 - final2, weight.dtype.type(_TINY)), final2 / c2
         for p in range(n):
             s = squared[p]
             root = math.sqrt(s)
             share = (root * (two * c - root) - final2) / wide
             share = min(max(share, least), one) if root < c else one + (root - root)
             total += weight[p] * (s if s * c2 <= final2 * final2 else final2 * share)
-    return total, kept
+    return total
 
 
 @vectorised
-def _reweigh(kernel: int, scale: Array, view: Array, n: int) -> None:
-    """Scale residuals and roots of weights by sqrt(rho'(s))."""
-    if kernel == 0:
-        return
-    zero, one = view.dtype.type(0), view.dtype.type(1)
-    squared, c2 = view[_SQ : _SQ + TILE], scale[0]
+def _by_component(view: Array, n: int) -> None:
+    tiny = view.dtype.type(1e-37)
+    for p in range(n):
+        wu, wv = view[_SU + p] * view[_SU + p], view[_SV + p] * view[_SV + p]
+        view[_QU + p] = view[_EU + p] * view[_EU + p] / (wu if wu > tiny else tiny)
+        view[_QV + p] = view[_EV + p] * view[_EV + p] / (wv if wv > tiny else tiny)
+        view[_WU + p], view[_WV + p] = wu, wv
+
+
+@vectorised
+def _cost_sum(robust: Robust, scale: Array, view: Array, n: int) -> tuple[float, float]:
+    """Sums of the robust cost and of wmax over a tile."""
+    kept = view.dtype.type(0)
+    for p in range(n):
+        kept += view[_WM + p]
+    if not robust.componentwise:
+        return _rho_sum(robust.kernel, scale, view[_SQ : _SQ + TILE], view[_WM : _WM + TILE], n), kept
+    _by_component(view, n)
+    of_u = _rho_sum(robust.kernel, scale, view[_QU : _QU + TILE], view[_WU : _WU + TILE], n)
+    return of_u + _rho_sum(robust.kernel, scale, view[_QV : _QV + TILE], view[_WV : _WV + TILE], n), kept
+
+
+@vectorised
+def _root_slope(kernel: int, scale: Array, squared: Array, n: int) -> None:
+    """sqrt(rho'(s)) in place of s."""
+    zero, one, c2 = squared.dtype.type(0), squared.dtype.type(1), scale[0]
     if kernel == 1:
         for p in range(n):
             s = squared[p]
@@ -192,13 +170,31 @@ def _reweigh(kernel: int, scale: Array, view: Array, n: int) -> None:
             squared[p] = zero if inside < zero else inside
     else:
         c, final2 = math.sqrt(c2), scale[1]
-        wide = max(c2 - final2, view.dtype.type(_TINY))
+        wide = max(c2 - final2, squared.dtype.type(_TINY))
         most = wide / c
         for p in range(n):
             s = squared[p]
             root = math.sqrt(s)
             gap = min(max(c - root, zero), most)
             squared[p] = one if s * c2 <= final2 * final2 else math.sqrt(final2 * (gap / wide) / root)
+
+
+@vectorised
+def _reweigh(robust: Robust, scale: Array, view: Array, n: int) -> None:
+    """Scale residuals and roots of weights by sqrt(rho'(s))."""
+    if robust.kernel == 0:
+        return
+    if robust.componentwise:
+        _by_component(view, n)
+        _root_slope(robust.kernel, scale, view[_QU : _QU + TILE], n)
+        _root_slope(robust.kernel, scale, view[_QV : _QV + TILE], n)
+        for p in range(n):
+            view[_EU + p] *= view[_QU + p]
+            view[_SU + p] *= view[_QU + p]
+            view[_EV + p] *= view[_QV + p]
+            view[_SV + p] *= view[_QV + p]
+        return
+    _root_slope(robust.kernel, scale, view[_SQ : _SQ + TILE], n)
     for p in range(n):
         root = view[_SQ + p]
         view[_EU + p] *= root
@@ -240,10 +236,7 @@ def _differentiate(
     for k in range(2):
         if free[k]:
             rays = pose.rays_by_intrinsics[graph.table[frame], k]
-            if free[2]:
-                _apart_rows(rays, camera, row, k, start, n, view, jacobian)
-            else:
-                _intrinsic_row(rays, camera, row, k, start, n, view, jacobian)
+            _intrinsic_rows(rays, camera, row, k, start, n, free[2], view, jacobian)
     if n < TILE:
         for r in range(26):
             for p in range(n, TILE):
@@ -251,48 +244,41 @@ def _differentiate(
 
 
 @vectorised
-def _intrinsic_row(
-    rays: Array, camera: Array, row: Array, k: int, start: int, n: int, view: Array, jacobian: Array
+def _intrinsic_rows(
+    rays: Array, camera: Array, row: Array, k: int, start: int, n: int, apart: bool, view: Array, jacobian: Array
 ) -> None:
-    """The row of log f (k = 0) or alpha (k = 1): J_X R d ray / dk + d project / dk, with `rays` (3, P) d ray / dk."""
+    """The row of log f (k = 0) or alpha (k = 1): J_X R d ray / dk + d project / dk, with `rays` (3, P) d ray / dk.
+
+    Where cameras are apart, the first is in the row of the source's camera and the second in that of the target's.
+    Both camera derivatives are multiples of f px: by 1 for log f, by -|X| / s for alpha.
+    """
     rx, ry, rz = rays[0][start:], rays[1][start:], rays[2][start:]
     fx, fy = camera[0], camera[1]
     r00, r01, r02, r10, r11, r12 = row[0], row[1], row[2], row[4], row[5], row[6]
     r20, r21, r22 = row[8], row[9], row[10]
     by_point = jacobian[_BY_POINT : _BY_POINT + 6 * TILE]
     out = jacobian[(12 + 2 * k) * TILE : (14 + 2 * k) * TILE]
+    # Written out twice: a compiler contracts sums of products in one piece otherwise, and results keep their bits.
+    if not apart:
+        for p in range(n):
+            a, b, c = rx[p], ry[p], rz[p]
+            x, y, z = r00 * a + r01 * b + r02 * c, r10 * a + r11 * b + r12 * c, r20 * a + r21 * b + r22 * c
+            share = -view[_NORM + p] * view[_INV + p] if k == 1 else view.dtype.type(1)
+            u = x * by_point[p] + y * by_point[2 * TILE + p] + z * by_point[4 * TILE + p]
+            v = x * by_point[TILE + p] + y * by_point[3 * TILE + p] + z * by_point[5 * TILE + p]
+            out[p] = u + share * (view[_SU + p] * fx * view[_PX + p])
+            out[TILE + p] = v + share * (view[_SV + p] * fy * view[_PY + p])
+        return
     for p in range(n):
         a, b, c = rx[p], ry[p], rz[p]
         x, y, z = r00 * a + r01 * b + r02 * c, r10 * a + r11 * b + r12 * c, r20 * a + r21 * b + r22 * c
-        # Both camera derivatives are multiples of f px: by 1 for log f, by -|X| / s for alpha.
-        share = -view[_NORM + p] * view[_INV + p] if k == 1 else view.dtype.type(1)
-        u = x * by_point[p] + y * by_point[2 * TILE + p] + z * by_point[4 * TILE + p]
-        v = x * by_point[TILE + p] + y * by_point[3 * TILE + p] + z * by_point[5 * TILE + p]
-        out[p] = u + share * (view[_SU + p] * fx * view[_PX + p])
-        out[TILE + p] = v + share * (view[_SV + p] * fy * view[_PY + p])
-
-
-@vectorised
-def _apart_rows(
-    rays: Array, camera: Array, row: Array, k: int, start: int, n: int, view: Array, jacobian: Array
-) -> None:
-    """As `_intrinsic_row`, J_X R d ray / dk in the row of the source's camera and d project / dk in the target's."""
-    rx, ry, rz = rays[0][start:], rays[1][start:], rays[2][start:]
-    fx, fy = camera[0], camera[1]
-    r00, r01, r02, r10, r11, r12 = row[0], row[1], row[2], row[4], row[5], row[6]
-    r20, r21, r22 = row[8], row[9], row[10]
-    by_point = jacobian[_BY_POINT : _BY_POINT + 6 * TILE]
-    of_source = jacobian[(12 + 2 * k) * TILE : (14 + 2 * k) * TILE]
-    of_target = jacobian[_OF_TARGET + 2 * k * TILE : _OF_TARGET + (2 * k + 2) * TILE]
-    for p in range(n):
-        a, b, c = rx[p], ry[p], rz[p]
-        x, y, z = r00 * a + r01 * b + r02 * c, r10 * a + r11 * b + r12 * c, r20 * a + r21 * b + r22 * c
-        of_source[p] = x * by_point[p] + y * by_point[2 * TILE + p] + z * by_point[4 * TILE + p]
-        of_source[TILE + p] = x * by_point[TILE + p] + y * by_point[3 * TILE + p] + z * by_point[5 * TILE + p]
+        out[p] = x * by_point[p] + y * by_point[2 * TILE + p] + z * by_point[4 * TILE + p]
+        out[TILE + p] = x * by_point[TILE + p] + y * by_point[3 * TILE + p] + z * by_point[5 * TILE + p]
+    out = jacobian[_OF_TARGET + 2 * k * TILE : _OF_TARGET + (2 * k + 2) * TILE]
     for p in range(n):
         share = -view[_NORM + p] * view[_INV + p] if k == 1 else view.dtype.type(1)
-        of_target[p] = share * (view[_SU + p] * fx * view[_PX + p])
-        of_target[TILE + p] = share * (view[_SV + p] * fy * view[_PY + p])
+        out[p] = share * (view[_SU + p] * fx * view[_PX + p])
+        out[TILE + p] = share * (view[_SV + p] * fy * view[_PY + p])
 
 
 @vectorised
@@ -391,12 +377,11 @@ def _prior_pull(prior: DepthPrior, depth: Array, frame: int, start: int, n: int,
 
 @vectorised
 def evaluate(
-    graph: Graph, pose: Pose, prior: DepthPrior, kernel: int, scale: Array, begin: int, end: int, sums: Array
+    graph: Graph, pose: Pose, prior: DepthPrior, robust: Robust, scale: Array, begin: int, end: int, sums: Array
 ) -> None:
     """Robust cost of the frames begin:end.
 
     Args:
-        kernel: Of `robust.CODE`.
         scale: (2,) squares of the kernel's scale and of the one it ends at, px^2.
         sums: (N, 4) float64 zeros, filled with wmax rho(s), wmax of what is imaged, all wmax, and the prior's cost.
     """
@@ -411,7 +396,7 @@ def evaluate(
             n = min(TILE, cells - start)
             for order in range(graph.first[frame], graph.first[frame + 1]):
                 sums[frame, 2] += _see(graph, pose, frame, order, start, n, view)
-                cost, kept = _rho_sum(kernel, scale, view, n)
+                cost, kept = _cost_sum(robust, scale, view, n)
                 sums[frame, 0] += cost
                 sums[frame, 1] += kept
             if graph.depth_free[frame]:
@@ -423,7 +408,7 @@ def linearise(
     graph: Graph,
     pose: Pose,
     prior: DepthPrior,
-    kernel: int,
+    robust: Robust,
     scale: Array,
     free: Array,
     cameras: int,
@@ -471,10 +456,10 @@ def linearise(
                     coupling[(6 * degree + 2) * TILE + p] = pull[p]
             for order in range(first, last):
                 sums[frame, 2] += _see(graph, pose, frame, order, start, n, view)
-                cost, kept = _rho_sum(kernel, scale, view, n)
+                cost, kept = _cost_sum(robust, scale, view, n)
                 sums[frame, 0] += cost
                 sums[frame, 1] += kept
-                _reweigh(kernel, scale, view, n)
+                _reweigh(robust, scale, view, n)
                 _differentiate(graph, pose, frame, order, start, n, free, view, jacobian)
                 _gram(jacobian, rows // 3, 2 * TILE, direct, rows * rows * order)
                 if depth_free:
@@ -555,7 +540,7 @@ def back_substitute(
     graph: Graph,
     pose: Pose,
     prior: DepthPrior,
-    kernel: int,
+    robust: Robust,
     scale: Array,
     twist: Array,
     damping: Array,
@@ -588,7 +573,7 @@ def back_substitute(
                 sums[2 * TILE + p] = sums[TILE + p]
             for order in range(first, last):
                 _see(graph, pose, frame, order, start, n, view)
-                _reweigh(kernel, scale, view, n)
+                _reweigh(robust, scale, view, n)
                 _follow(graph, pose, twist[order], order, frame, start, n, view, change, sums)
             out = step[frame][start : start + n]
             total = zero

@@ -225,7 +225,7 @@ def _wider_scales(problem: Problem, state: State, options: Options) -> list[floa
     if first is None or options.robust == "none":
         return []
     if math.isinf(first):
-        first = math.sqrt(2) * largest_residual_px(problem, state)
+        first = math.sqrt(2) * largest_residual_px(problem, state, componentwise=options.componentwise)
     if first <= final:
         return []
     span = 2 * math.log(first / final)
@@ -280,6 +280,8 @@ def _lost_rho(options: Options, scale_px: float, cost: Cost) -> Tensor:
     """What a measurement costs whose point is not in front of its camera: as much as a gross outlier, px^2."""
     far = torch.full_like(cost.weight, (10 * scale_px) ** 2)
     outlier = robust.cost(options.robust, scale_px, far, options.robust_scale_px)
+    if options.componentwise:
+        outlier = 2 * outlier
     return torch.maximum(outlier, 4 * cost.measurements / cost.weight)
 
 

@@ -83,6 +83,7 @@ def _arguments(problem: Problem, state: State, options: Options) -> tuple[Any, .
         state.intrinsics.to(device),
         None if state.cam_from_rig is None else state.cam_from_rig.to(device),
         options.robust,
+        options.componentwise,
         options.max_iterations,
         options.initial_scale_px,
         [
@@ -122,6 +123,7 @@ def _problem(
     intrinsics: Tensor,
     cam_from_rig: Tensor | None,
     robust: str,
+    componentwise: bool,
     max_iterations: int,
     initial_scale_px: float | None,
     settings: Sequence[float],
@@ -148,6 +150,7 @@ def _problem(
         max_iterations=max_iterations,
         relative_tolerance=tolerance,
         robust=cast("RobustKernel", robust),
+        componentwise=componentwise,
         robust_scale_px=scale_px,
         initial_scale_px=initial_scale_px,
         initial_damping=damping,
@@ -165,7 +168,8 @@ _SCHEMA = (
     "Tensor? prior_depth, Tensor? prior_depth_weight, float[] prior_log_focal, Tensor? prior_cam_from_rig, "
     "float prior_log_focal_sigma, Tensor? prior_extrinsic_sigma, "
     "Tensor? pose_of_frame, Tensor? view_of_frame, Tensor cam_from_world, Tensor inverse_depth, Tensor intrinsics, "
-    "Tensor? cam_from_rig, str robust, int max_iterations, float? initial_scale_px, float[] settings) "
+    "Tensor? cam_from_rig, str robust, bool componentwise, int max_iterations, float? initial_scale_px, "
+    "float[] settings) "
     "-> (Tensor cam_from_world, Tensor inverse_depth, Tensor intrinsics, Tensor cam_from_rig, Tensor report)"
 )
 

@@ -92,8 +92,10 @@ def newton_step(problem: Problem, state: State, options: Options, damping: float
 
     residual, valid = measure(start)
     squared = ((sqrt_weight * residual) ** 2).sum(-1) / edges.weight.double().amax(-1).clamp_min(1e-300)
-    slope = robust.root_slope(options.robust, options.robust_scale_px, squared)
-    scale = sqrt_weight * valid[..., None] * (1.0 if slope is None else slope[..., None])
+    slope = robust.root_slope(
+        options.robust, options.robust_scale_px, residual**2 if options.componentwise else squared[..., None]
+    )
+    scale = sqrt_weight * valid[..., None] * (1.0 if slope is None else slope)
 
     def weighted(update: Tensor) -> Tensor:
         rows = [(scale * measure(update)[0]).flatten()]

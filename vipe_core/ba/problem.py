@@ -228,6 +228,7 @@ class Options:
         relative_tolerance: Stop when a step lowers the cost, or is expected to, by less than this share.
         robust: Kernel on the 2-norm of the residual in pixels. `truncated` is truncated least squares, min(s, c^2):
             what is further off than c has no say at all, so it needs a start within c, or graduation.
+        componentwise: Whether the kernel judges u and v each for itself, as the paper's own code does; not the norm.
         robust_scale_px: Its scale c.
         initial_scale_px: Graduated non-convexity (Yang et al. 2020): the scale to begin with, which narrows to c as the
             cost is lowered; infinity begins where a Geman-McClure or truncated kernel is convex over all residuals.
@@ -241,6 +242,7 @@ class Options:
     max_iterations: int = 10
     relative_tolerance: float = 1e-4
     robust: RobustKernel = "geman_mcclure"
+    componentwise: bool = False
     robust_scale_px: float = 3.0
     initial_scale_px: float | None = None
     initial_damping: float = 1e-4
@@ -269,7 +271,7 @@ class Result:
         status: Why it ended.
         iterations: Steps tried.
         initial_cost: Robust cost of the measurements before: sum of w rho(r^T W r / w) at scale c, with w the larger of
-            the two weights of a measurement. Priors are not in it.
+            the two weights of a measurement; componentwise, of w_u rho(r_u^2) + w_v rho(r_v^2). Priors are not in it.
         cost: Robust cost after.
         weight_sum: Sum of these w over valid measurements at the end; `cost / weight_sum` is a mean squared residual,
             px^2.

@@ -59,17 +59,23 @@ def robust_scale_px(
     return min(max(_EFFICIENT_RATIO[kernel] * sigma, low), high) if math.isfinite(sigma) else low
 
 
-def largest_residual_px(problem: Problem, state: State) -> float:
+def largest_residual_px(problem: Problem, state: State, *, componentwise: bool = False) -> float:
     """The largest root of the robust kernel's argument s over all measurements; 0 without any."""
     everything = torch.arange(len(problem.edges.source))
     parts = [
-        float(torch.where(weight > 0, squared, 0).max()) for squared, weight in _squared(problem, state, everything)
+        float(torch.where(weight > 0, squared, 0).max())
+        for squared, weight in _squared(problem, state, everything, componentwise=componentwise)
     ]
     return math.sqrt(max(parts, default=0.0))
 
 
-def _squared(problem: Problem, state: State, chosen: Tensor) -> Iterator[tuple[Tensor, Tensor]]:
-    """Squared residual s = r^T W r / wmax and wmax (0 where not projected), (n, P) each, of some edges in batches."""
+def _squared(
+    problem: Problem, state: State, chosen: Tensor, *, componentwise: bool = False
+) -> Iterator[tuple[Tensor, Tensor]]:
+    """Squared residual s = r^T W r / wmax and wmax (0 where not projected), (n, P) each, of some edges in batches.
+
+    Componentwise, s is the larger of the two.
+    """
     edges, device = problem.edges, state.inverse_depth.device
     batch_size = max(_BATCH_CELLS // max(problem.grid.num_cells, 1), 1)
     for start in range(0, len(chosen), batch_size):
@@ -88,4 +94,6 @@ def _squared(problem: Problem, state: State, chosen: Tensor) -> Iterator[tuple[T
         error = torch.where(weight > 0, px - batch.target_px.to(device), 0)
         largest = weight.amax(-1)
         squared = (weight * error * error).sum(-1) / torch.where(largest > 0, largest, 1)
+        if componentwise:
+            squared = error.square().amax(-1)
         yield squared, torch.where(projected, largest, 0)

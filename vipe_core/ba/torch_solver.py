@@ -8,7 +8,8 @@ Problem. Minimise over poses G_i = cam_from_world, intrinsics k = (log f, alpha)
     sum_e sum_p  wmax rho(s),   s = r^T W r / wmax,   r = project(R_e ray(p; k) + d(p) t_e; k) - target,   W = diag(w)
 
 plus priors on d and log f. wmax is the larger of the two weights of a measurement, so that rho judges pixels and not
-confidences, and a component without weight has no say. (R_e, t_e) = T_e = G_j G_i^-1 for edge e = (i -> j).
+confidences, and a component without weight has no say. Where rho judges components, w_u rho(r_u^2) + w_v rho(r_v^2)
+takes the place of wmax rho(s). (R_e, t_e) = T_e = G_j G_i^-1 for edge e = (i -> j).
 
 Linearisation. One step of iteratively reweighted least squares: residual and Jacobian rows are scaled by
 sqrt(w rho'(s)). Poses act on a pixel only through the left twist tau_e of T_e. With left perturbations of both poses
@@ -82,7 +83,7 @@ class _View:
 
     points (F, D, 3, P) homogeneous, rotation (F, D, 3, 3), translation (F, D, 3, 1), s (F, D, 1, P), norm (F, D, 1, P)
     or None, xy (F, D, 2, P) = points / s, valid (F, D, P), weighted (F, D, 2, P) = sqrt(w) r (zero where not valid),
-    squared (F, D, P) = s of the robust kernel, px^2.
+    squared (F, D, 1, P) = s of the robust kernel, px^2, or (F, D, 2, P) componentwise.
     """
 
     points: Tensor
@@ -222,7 +223,11 @@ class TorchSolver:
         xy = points[:, :, :2] / s
         error = torch.addcmul(geometry.centre[at_target] - measured.target_px, xy, geometry.focal[at_target])
         weighted = error.mul_(measured.root_weight).mul_(valid[:, :, None])
-        squared = (weighted * weighted).sum(2).div_(measured.max_weight.clamp_min(torch.finfo(self.dtype).tiny))
+        squared, tiny = weighted * weighted, torch.finfo(self.dtype).tiny
+        if self.options.componentwise:
+            squared = squared.div_(measured.root_weight.square().clamp_min(tiny))
+        else:
+            squared = squared.sum(2).div_(measured.max_weight.clamp_min(tiny))[:, :, None]
         return _View(points, rotation, translation, s, norm, xy, valid, weighted, squared)
 
     def cost(self, state: State, scale_px: float) -> Cost:
@@ -239,9 +244,11 @@ class TorchSolver:
         self, sums: Tensor, chunk: Chunk, measured: _Measured, view: _View, state: State, scale_px: float
     ) -> None:
         """Add robust cost, valid weight, all weight and depth prior of a chunk to `sums` (4,)."""
+        componentwise = self.options.componentwise
         kept_weight = measured.max_weight * view.valid
         rho = robust.cost(self.options.robust, scale_px, view.squared, self.options.robust_scale_px)
-        sums[0] += (rho * kept_weight).sum(-1).double().sum()
+        weight = measured.root_weight.square() * view.valid[:, :, None] if componentwise else kept_weight[:, :, None]
+        sums[0] += (rho * weight).sum(-1).double().sum()
         sums[1] += kept_weight.sum(-1).double().sum()
         sums[2] += measured.max_weight.sum(-1).double().sum()
         prior = self._depth_prior(chunk, state)
@@ -286,8 +293,8 @@ class TorchSolver:
         residual = view.weighted
         slope = robust.root_slope(self.options.robust, scale_px, view.squared, self.options.robust_scale_px)
         if slope is not None:
-            scale = scale * slope[:, :, None]
-            residual = residual * slope[:, :, None]
+            scale = scale * slope
+            residual = residual * slope
         # J_X = scale f / s (1 - xy slope^T), slope = e_z + alpha X / |X|.
         diagonal = scale * geometry.focal[at_target] / view.s
         outer = -diagonal * view.xy

@@ -13,7 +13,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
-from typing import Any
+from typing import Any, Final, Literal
 
 from vipe_core.ba import rules
 from vipe_core.ba.cuda import context
@@ -39,6 +39,10 @@ SYSTEM_KERNELS = (
     *("damp", "gather", "factorise", "substitute", "propose", "covariance", "finish"),
 )
 TILE_KERNELS = ("tile", "tile_large")
+COMPONENTWISE: Final = "componentwise"
+"""Stands for all kernels of residuals where they judge components: which one, a pass over the cells asks as it runs."""
+# Numbered as `CODE` does, in whose order they are.
+_ROBUST: tuple[RobustKernel | Literal["componentwise"], ...] = (*CODE, COMPONENTWISE)
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,7 +53,7 @@ class Specialisation:
     unified: bool
     focal: bool
     alpha: bool
-    robust: RobustKernel
+    robust: RobustKernel | Literal["componentwise"]
     apart: bool = False
     points: bool = False
 
@@ -66,14 +70,14 @@ class Specialisation:
         flags = ", ".join(str(flag).lower() for flag in (self.unified, self.focal, self.alpha, self.apart, self.points))
         kernels = zip(self.resident_blocks.items(), ("false", "true"), strict=True)
         return "".join(
-            f"DEFINE_TILE_KERNEL({name}{suffix}, {flags}, {CODE[self.robust]}, {large}, {blocks})\n"
+            f"DEFINE_TILE_KERNEL({name}{suffix}, {flags}, {_ROBUST.index(self.robust)}, {large}, {blocks})\n"
             for (name, blocks), large in kernels
         )
 
 
 def specialisations() -> Iterable[Specialisation]:
     """All there are: alpha is an intrinsic of the unified camera only."""
-    for robust in CODE:
+    for robust in _ROBUST:
         for unified, focal, alpha in ((0, 0, 0), (0, 1, 0), (1, 0, 0), (1, 1, 0), (1, 0, 1), (1, 1, 1)):
             for apart in (False, True) if focal or alpha else (False,):
                 for points in (False, True):

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from vipe_core.ba.answer import Answer, num_cameras, report_size
-from vipe_core.ba.cuda.compiler import Specialisation
+from vipe_core.ba.cuda.compiler import COMPONENTWISE, Specialisation
 from vipe_core.ba.cuda.context import (
     ASSEMBLE_BLOCKS,
     CONTROL_BYTES,
@@ -45,7 +45,8 @@ def specialisation(problem: Problem, state: State, options: Options) -> Speciali
     unified, free = problem.camera_model == "mei", problem.free
     focal, alpha = free.focal, unified and free.distortion
     apart, points = (focal or alpha) and num_cameras(state) > 1, isinstance(problem.grid, Points)
-    return Specialisation(unified, focal, alpha, options.robust, apart, points)
+    robust = COMPONENTWISE if options.componentwise else options.robust
+    return Specialisation(unified, focal, alpha, robust, apart, points)
 
 
 class Adjustment:
@@ -187,6 +188,7 @@ class Adjustment:
             focal_free=focal_free,
             alpha_free=alpha_free,
             robust=CODE[options.robust],
+            componentwise=options.componentwise,
             anything_free=layout.num_nodes > 0 or focal_free or alpha_free or any_depth,
             max_iterations=options.max_iterations,
             has_prior=self._has_prior,

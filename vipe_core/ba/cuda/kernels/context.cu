@@ -20,8 +20,8 @@ typedef long long i64;
 
 // RUNNING, then as `Status` of `vipe_core/ba/problem.py`.
 enum Status { RUNNING, CONVERGED, MAX_ITERATIONS, NO_PROGRESS, SINGULAR, NON_FINITE, EMPTY };
-// As `CODE` of `vipe_core/ba/robust.py`.
-enum Robust { NONE, HUBER, CAUCHY, GEMAN_MCCLURE, TUKEY, TRUNCATED };
+// As `CODE` of `vipe_core/ba/robust.py`; and any of them, chosen when it runs, on each component of a residual.
+enum Robust { NONE, HUBER, CAUCHY, GEMAN_MCCLURE, TUKEY, TRUNCATED, COMPONENTWISE };
 // What the next pass over the cells is for: nothing, the normal equations at the state, or those of a candidate.
 enum Mode { IDLE, LINEARISE, STEP };
 
@@ -49,7 +49,7 @@ struct Context {
     i64 num_intrinsics;  // how many of these there are
     i64 num_blocks;   // 6x6 blocks of the reduced system
     i64 num_sides;    // tiles along a side of the factor
-    i64 unified, focal_free, alpha_free, robust, anything_free, max_iterations;
+    i64 unified, focal_free, alpha_free, robust, componentwise, anything_free, max_iterations;
     i64 has_prior;
     i64 scratch_stride;  // floats of `scratch` per block
     i64 num_cameras;     // with intrinsics of their own: 1, or the views of a rig

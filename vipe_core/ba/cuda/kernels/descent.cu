@@ -23,8 +23,8 @@ __device__ inline void judge_at(const Context& c, Control& control, double measu
     control.lost = lost;
     control.prior = prior;
     // A lost measurement costs as much as a gross outlier, else losing them all would be best.
-    const double scale = control.scale_next, outlier = robust_cost((int)c.robust, scale, c.robust_scale, 100 * scale * scale);
-    const double mean = 4 * measured / weight;
+    const double scale = control.scale_next, mean = 4 * measured / weight;
+    const double outlier = (c.componentwise ? 2 : 1) * robust_cost((int)c.robust, scale, c.robust_scale, 100 * scale * scale);
     control.lost_rho = outlier > mean ? outlier : mean;
 }
 

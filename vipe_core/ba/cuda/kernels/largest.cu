@@ -17,7 +17,9 @@ __device__ inline void largest_of_edge(const Context& c, float* rays, float* fou
                                                      c.depth[source * P + cell],
                                                      ((const float2*)c.target_px)[row + cell],
                                                      ((const float2*)c.weight)[row + cell], inside);
-        most = view.squared > most ? view.squared : most;
+        float squared = view.squared;
+        if (c.componentwise) squared = squared_u(view) > squared_v(view) ? squared_u(view) : squared_v(view);
+        most = squared > most ? squared : most;
     }
     found[thread] = most;
     __syncthreads();

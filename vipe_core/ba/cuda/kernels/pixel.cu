@@ -157,29 +157,84 @@ __device__ inline float rho(const Scale& scale, float s) {
     return s;
 }
 
-// Scale residuals and roots of weights by sqrt(rho'(s)).
+// sqrt(rho'(s)).
 template <int ROBUST>
-__device__ inline void reweigh(const Scale& scale, View& view) {
+__device__ inline float root_slope(const Scale& scale, float s) {
     const float c2 = scale.c2;
-    float root;
-    if constexpr (ROBUST == NONE) return;
-    if constexpr (ROBUST == HUBER) root = sqrtf(sqrtf(c2 / (view.squared > c2 ? view.squared : c2)));
-    if constexpr (ROBUST == CAUCHY) root = 1.0f / sqrtf(1.0f + view.squared / c2);
-    if constexpr (ROBUST == GEMAN_MCCLURE) root = c2 / (c2 + view.squared);
+    if constexpr (ROBUST == HUBER) return sqrtf(sqrtf(c2 / (s > c2 ? s : c2)));
+    if constexpr (ROBUST == CAUCHY) return 1.0f / sqrtf(1.0f + s / c2);
+    if constexpr (ROBUST == GEMAN_MCCLURE) return c2 / (c2 + s);
     if constexpr (ROBUST == TUKEY) {
-        root = 1.0f - view.squared / c2;
-        root = root < 0.0f ? 0.0f : root;
+        const float root = 1.0f - s / c2;
+        return root < 0.0f ? 0.0f : root;
     }
     if constexpr (ROBUST == TRUNCATED) {
-        const float r = sqrtf(view.squared), wide = width(scale), most = wide / scale.c;
+        const float r = sqrtf(s), wide = width(scale), most = wide / scale.c;
         float gap = scale.c - r;
         gap = gap < 0.0f ? 0.0f : gap > most ? most : gap;
-        root = is_inlier(scale, view.squared) ? 1.0f : sqrtf(scale.final2 * (gap / wide) / r);
+        return is_inlier(scale, s) ? 1.0f : sqrtf(scale.final2 * (gap / wide) / r);
     }
-    view.eu *= root;
-    view.ev *= root;
-    view.su *= root;
-    view.sv *= root;
+    return 1.0f;
+}
+
+// Squares of the components of a residual, px^2.
+__device__ inline float squared_u(const View& view) {
+    const float weight = view.su * view.su;
+    return view.eu * view.eu / (weight > 1e-37f ? weight : 1e-37f);
+}
+
+__device__ inline float squared_v(const View& view) {
+    const float weight = view.sv * view.sv;
+    return view.ev * view.ev / (weight > 1e-37f ? weight : 1e-37f);
+}
+
+// Both by a kernel that is known when it runs.
+__device__ inline float rho_of(int kernel, const Scale& scale, float s) {
+    switch (kernel) {
+        case HUBER: return rho<HUBER>(scale, s);
+        case CAUCHY: return rho<CAUCHY>(scale, s);
+        case GEMAN_MCCLURE: return rho<GEMAN_MCCLURE>(scale, s);
+        case TUKEY: return rho<TUKEY>(scale, s);
+        case TRUNCATED: return rho<TRUNCATED>(scale, s);
+        default: return s;
+    }
+}
+
+__device__ inline float root_slope_of(int kernel, const Scale& scale, float s) {
+    switch (kernel) {
+        case HUBER: return root_slope<HUBER>(scale, s);
+        case CAUCHY: return root_slope<CAUCHY>(scale, s);
+        case GEMAN_MCCLURE: return root_slope<GEMAN_MCCLURE>(scale, s);
+        case TUKEY: return root_slope<TUKEY>(scale, s);
+        case TRUNCATED: return root_slope<TRUNCATED>(scale, s);
+        default: return 1.0f;
+    }
+}
+
+// Robust cost of a cell.
+template <int ROBUST>
+__device__ inline float cost_of(int kernel, const Scale& scale, const View& view) {
+    if constexpr (ROBUST == COMPONENTWISE)
+        return view.su * view.su * rho_of(kernel, scale, squared_u(view)) +
+               view.sv * view.sv * rho_of(kernel, scale, squared_v(view));
+    return view.weight * rho<ROBUST>(scale, view.squared);
+}
+
+// Scale residuals and roots of weights by sqrt(rho'(s)).
+template <int ROBUST>
+__device__ inline void reweigh(int kernel, const Scale& scale, View& view) {
+    if constexpr (ROBUST == NONE) return;
+    float by_u, by_v;
+    if constexpr (ROBUST == COMPONENTWISE) {
+        by_u = root_slope_of(kernel, scale, squared_u(view));
+        by_v = root_slope_of(kernel, scale, squared_v(view));
+    } else {
+        by_u = by_v = root_slope<ROBUST>(scale, view.squared);
+    }
+    view.eu *= by_u;
+    view.ev *= by_v;
+    view.su *= by_u;
+    view.sv *= by_v;
 }
 
 // Derivatives of the pixel by the point, scaled: J_X = g (1 - (px, py) slope^T), slope = e_z + alpha X / |X|.

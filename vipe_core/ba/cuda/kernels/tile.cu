@@ -157,7 +157,7 @@ __device__ inline void tile_pass(const Context& c, int first_unit, float* shared
                     View view = see<UNIFIED, FOCAL, ALPHA>(before, transform, rays, p, depths[p],
                                                            ((const float2*)c.target_px)[at_cell],
                                                            ((const float2*)c.weight)[at_cell], inside);
-                    reweigh<ROBUST>(scale_now, view);
+                    reweigh<ROBUST>((int)c.robust, scale_now, view);
                     const ByPoint j = by_point<UNIFIED>(before, view);
                     const float2 d = push<UNIFIED>(j, view, transform[3], transform[7], transform[11]);
                     float x = twist[0] * depths[p] + twist[4] * view.z - twist[5] * view.y;
@@ -237,12 +237,12 @@ __device__ inline void tile_pass(const Context& c, int first_unit, float* shared
                 View view = see<UNIFIED, FOCAL, ALPHA>(camera, transform, rays, p, depths[p],
                                                        ((const float2*)c.target_px)[at_cell],
                                                        ((const float2*)c.weight)[at_cell], inside);
-                const float cost = view.weight * rho<ROBUST>(scale_judge, view.squared);
+                const float cost = cost_of<ROBUST>((int)c.robust, scale_judge, view);
                 sums[PRODUCTS] += cost;
-                sums[PRODUCTS + 1] += one_scale ? cost : view.weight * rho<ROBUST>(scale_next, view.squared);
+                sums[PRODUCTS + 1] += one_scale ? cost : cost_of<ROBUST>((int)c.robust, scale_next, view);
                 sums[PRODUCTS + 2] += view.weight;
                 sums[PRODUCTS + 3] += view.all_weight;
-                reweigh<ROBUST>(scale_next, view);
+                reweigh<ROBUST>((int)c.robust, scale_next, view);
 
                 const ByPoint j = by_point<UNIFIED>(camera, view);
                 const float au = j.gu * view.px, av = j.gv * view.py, d = depths[p];
