@@ -82,6 +82,7 @@ def bucket(s3_endpoint: str, monkeypatch: pytest.MonkeyPatch) -> str:
 
 
 @pytest.mark.long
+@pytest.mark.timeout(1200)
 def test_a_job_from_s3_to_s3_survives_kill_9(
     bucket: str, service: Service, clip: Path, vipectl: Run, tmp_path: Path, s3_endpoint: str
 ) -> None:
@@ -96,11 +97,11 @@ def test_a_job_from_s3_to_s3_survives_kill_9(
         answer: dict[str, Any] = service.client.job(job_id)["progress"]
         return answer
 
-    wait_for(lambda: progress()["shards_committed"] >= 1, "the first commit")
+    wait_for(lambda: progress()["shards_committed"] >= 1, "the first commit", 400)
     service.end(signal.SIGKILL)
     service.start()
     assert service.client.submit(spec, idempotency_key="once")["id"] == job_id
-    wait_for(lambda: service.client.job(job_id)["finished_at"], "the job to end")
+    wait_for(lambda: service.client.job(job_id)["finished_at"], "the job to end", 400)
 
     job = service.client.job(job_id)
     assert job["state"] == "succeeded_with_errors"
