@@ -19,7 +19,8 @@ def plain() -> tuple[Problem, State]:
     problem, truth = scene("mei", num_frames=3, height=3, width=4, distortion_free=True)
     problem = with_depth_prior(with_noise(problem, 0.1), truth.inverse_depth, 0.5)
     problem = replace(problem, priors=replace(problem.priors, log_focal=4.0, log_focal_sigma=0.2))
-    return float32(problem, disturbed(truth))
+    own = replace(problem.priors, inverse_depth_scale_sigma=0.1, inverse_depth_shift_sigma=0.2)
+    return float32(replace(problem, priors=own), disturbed(truth))
 
 
 def tracks() -> tuple[Problem, State]:

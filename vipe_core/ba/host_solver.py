@@ -7,6 +7,7 @@ grows with the edges and not with the square of the frames.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -16,7 +17,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from vipe_core.ba import block_cholesky, kernels, robust
+from vipe_core.ba import block_cholesky, depth_prior, kernels, robust
 from vipe_core.ba.kernel_inputs import Array, DepthPrior, Graph, Pose, Robust
 from vipe_core.ba.problem import Options, Points, Problem, State
 from vipe_core.ba.reduced import add_frames, add_twists, damp
@@ -45,6 +46,8 @@ class HostSystem:
         state: Where.
         scale: (2,) squares of the robust kernel's scale and of the one it ends at, px^2.
         cost: By-product of the linearisation.
+        prior: Of the depths.
+        of_prior: By frame, see `HostSolver._eliminate_priors`.
     """
 
     direct: Array
@@ -56,6 +59,8 @@ class HostSystem:
     state: State
     scale: Array
     cost: Cost
+    prior: DepthPrior
+    of_prior: list[Array] | None
 
 
 class HostSolver:
@@ -90,7 +95,9 @@ class HostSolver:
             source_camera=camera_of.numpy(),
             target_camera=camera_of[self._target].numpy(),
         )
-        self._prior = self._depth_prior(dtype)
+        sigmas = (problem.priors.inverse_depth_scale_sigma, problem.priors.inverse_depth_shift_sigma)
+        self._own_priors = np.array(sigmas) > 0 if depth_prior.has_freedom(problem.priors) else np.zeros(2, bool)
+        self._prior, _ = self._depth_prior(state)
 
         self._unknowns = unknowns = unknowns_of(problem)
         # Of the rig poses, then of the extrinsics that move, their numbers among the unknowns; -1 for what is held.
@@ -103,7 +110,8 @@ class HostSolver:
         self._free = np.array(self.intrinsics_free)
         # Cameras with unknowns of their own; where nothing is free, one that stands for all.
         self._num_apart = self._num_cameras if self._free.any() else 1
-        size = np.where(depth_free, 6 * degree.numpy() + kernels.TAIL * self._num_apart, 0)
+        tail = kernels.TAIL * (self._num_apart + bool(self._own_priors.any()))
+        size = np.where(depth_free, 6 * degree.numpy() + tail, 0)
         self._offset = np.zeros(num_frames + 1, np.int64)
         np.cumsum(size * size, out=self._offset[1:])
         self.anything_free = bool(self._num_unknown or self._free.any() or depth_free.any())
@@ -124,15 +132,20 @@ class HostSolver:
         cells = len(self._source) * grid.num_cells
         self._threads = max(1, min(torch.get_num_threads(), cells // _CELLS_PER_THREAD))
 
-    def _depth_prior(self, dtype: torch.dtype) -> DepthPrior:
-        priors = self.problem.priors
+    def _depth_prior(self, state: State) -> tuple[DepthPrior, depth_prior.DepthPrior | None]:
+        """For the kernels, and what it is. Where no frame has a scale or a shift of its own, always the same."""
+        priors, cells, dtype = self.problem.priors, self.problem.grid.num_cells, self._dtype
+        nothing = torch.empty(0, cells, dtype=dtype).numpy()
+        none = np.empty((0, 2, cells), nothing.dtype)
         if priors.inverse_depth is None or priors.inverse_depth_weight is None:
-            nothing = torch.empty(0, self.problem.grid.num_cells, dtype=dtype).numpy()
-            return DepthPrior(nothing, nothing)
-        return DepthPrior(
-            priors.inverse_depth.to(dtype).contiguous().numpy(),
-            priors.inverse_depth_weight.to(dtype).contiguous().numpy(),
-        )
+            return DepthPrior(nothing, nothing, none), None
+        weight = priors.inverse_depth_weight.to(dtype).contiguous()
+        fitted = depth_prior.depth_prior(priors, state.inverse_depth, slice(None)) if self._own_priors.any() else None
+        if fitted is None or fitted.coupling is None:
+            return DepthPrior(priors.inverse_depth.to(dtype).contiguous().numpy(), weight.numpy(), none), None
+        coupling = np.zeros((len(weight), 2, cells), nothing.dtype)
+        coupling[:, self._own_priors] = fitted.coupling.numpy()
+        return DepthPrior((state.inverse_depth + fitted.off).numpy(), weight.numpy(), coupling), fitted
 
     def _cliques(self, of_frame: Callable[[int], list[int]]) -> list[list[int]]:
         """Sets of unknowns that are coupled: a frame with free depths couples all that see it, an edge with fixed ones
@@ -230,8 +243,13 @@ class HostSolver:
     def _scale(self, scale_px: float) -> Array:
         return self._numbers(scale_px**2, self.options.robust_scale_px**2)
 
-    def _cost(self, sums: Array, state: State) -> Cost:
+    def _prior_at(self, state: State) -> tuple[DepthPrior, depth_prior.DepthPrior | None]:
+        return self._depth_prior(state) if self._own_priors.any() else (self._prior, None)
+
+    def _cost(self, sums: Array, state: State, fitted: depth_prior.DepthPrior | None) -> Cost:
         measurements, weight, everything, prior = sums.sum(axis=0).tolist()
+        if fitted is not None:
+            prior += float(fitted.cost.numpy()[self._depth_free].sum())
         priors = self.problem.priors
         if priors.log_focal is not None and self.intrinsics_free[0]:
             prior += float(np.square(self._log_focal_off(state) / priors.log_focal_sigma).sum())
@@ -252,16 +270,18 @@ class HostSolver:
     def cost(self, state: State, scale_px: float) -> Cost:
         """The robust cost at a state."""
         pose, _ = self._pose(state)
+        prior, fitted = self._prior_at(state)
         sums, scale = np.zeros((len(self._depth_free), 4)), self._scale(scale_px)
         self._over_frames(
-            lambda begin, end: kernels.evaluate(self._graph, pose, self._prior, self._kernel, scale, begin, end, sums)
+            lambda begin, end: kernels.evaluate(self._graph, pose, prior, self._kernel, scale, begin, end, sums)
         )
-        return self._cost(sums, state)
+        return self._cost(sums, state, fitted)
 
     def linearise(self, state: State, scale_px: float) -> HostSystem:
         """The normal equations at a state."""
         pose, transform = self._pose(state)
         graph, structure, scale = self._graph, self._structure, self._scale(scale_px)
+        prior, fitted = self._prior_at(state)
         sums = np.zeros((len(self._depth_free), 4))
         rows = kernels.ROWS if self._num_apart == 1 else kernels.ROWS_APART
         per_edge = np.zeros(rows**2 * len(self._source))
@@ -270,7 +290,7 @@ class HostSolver:
             lambda begin, end: kernels.linearise(
                 graph,
                 pose,
-                self._prior,
+                prior,
                 self._kernel,
                 scale,
                 np.append(self._free, self._num_apart > 1),
@@ -283,6 +303,7 @@ class HostSolver:
                 per_frame,
             )
         )
+        of_prior = self._eliminate_priors(per_frame, fitted)
         adjoint = se3.adjoint(transform).contiguous().numpy()
         turn = None if self._per_frame is None else np.asarray(turns_of(self.problem, state))
         assembled = self._per_frame or structure
@@ -332,7 +353,9 @@ class HostSolver:
 
         singly = np.arange(len(source) + 1)
         direct, direct_gradient = add(singly, rows**2 * singly, per_edge, of_edges)
-        eliminated, eliminated_gradient = add(graph.first, self._offset, per_frame, of_cameras)
+        # Scale and shift of a prior are no unknowns of the system any more.
+        of_frames = np.append(of_cameras, -1) if of_prior is not None else of_cameras
+        eliminated, eliminated_gradient = add(graph.first, self._offset, per_frame, of_frames)
         if (extrinsic := self._extrinsic_prior(state)) is not None:
             _, hessian, pull = extrinsic
             for view in np.flatnonzero(self._view_place >= 0):
@@ -353,8 +376,30 @@ class HostSolver:
             adjoint,
             state,
             scale,
-            self._cost(sums, state),
+            self._cost(sums, state, fitted),
+            prior,
+            of_prior,
         )
+
+    def _eliminate_priors(self, per_frame: Array, fitted: depth_prior.DepthPrior | None) -> list[Array] | None:
+        """Eliminate scales and shifts of priors from the frames' matrices.
+
+        Returns:
+            Of each frame S^-1 U^T Q [e_1; ..; v] (2, size), see `depth_prior.py`; None where they are held.
+        """
+        if fitted is None or fitted.curvature is None:
+            return None
+        own, found = np.flatnonzero(self._own_priors), []
+        for frame, (begin, end) in enumerate(pairwise(self._offset.tolist())):
+            size = math.isqrt(end - begin)
+            matrix = per_frame[begin:end].reshape(size, size)
+            pull = np.zeros((2, size))
+            if size:
+                rows = matrix[size - kernels.TAIL + own]
+                pull[own] = np.linalg.solve(fitted.curvature[frame].numpy() - rows[:, size - kernels.TAIL + own], rows)
+                matrix += rows.T @ pull[own]
+            found.append(pull)
+        return found
 
     def _factorise(self, system: HostSystem, damping: float) -> tuple[Array, Array, bool]:
         """Scale (nodes, 6), factor, and success of the damped, scaled reduced system."""
@@ -399,19 +444,20 @@ class HostSolver:
             twist[:, :6] = total[self._target.numpy()] - of_source
             twist[:, 6:8] = moved[self._graph.source_camera[self._source.numpy()]]
             twist[:, 8:] = moved[self._graph.target_camera]
-            gain = np.empty(len(self._depth_free))
+            shift, gain = self._prior_step(system, twist, moved), np.empty(len(self._depth_free))
             damping_of, out = self._numbers(damping), depth.numpy()
             self._over_frames(
                 lambda begin, end: kernels.back_substitute(
                     self._graph,
                     system.pose,
-                    self._prior,
+                    system.prior,
                     self._kernel,
                     system.scale,
                     twist,
                     damping_of,
                     begin,
                     end,
+                    shift,
                     out,
                     gain,
                 )
@@ -426,6 +472,19 @@ class HostSolver:
             factorised=torch.tensor(factorised),
             extrinsic=extrinsic,
         )
+
+    def _prior_step(self, system: HostSystem, twist: Array, moved: Array) -> Array:
+        """(N, 2) what scales and shifts of priors do to the right-hand sides of the depths."""
+        if system.of_prior is None:
+            return np.empty((0, 2), twist.dtype)
+        first, found = self._graph.first, np.zeros((len(self._depth_free), 2), twist.dtype)
+        for frame in np.flatnonzero(self._depth_free):
+            edges = twist[first[frame] : first[frame + 1], :6]
+            cameras = np.zeros((self._num_apart + 1, kernels.TAIL))
+            cameras[:-1, :2] = -moved[: self._num_apart]
+            cameras[0, 2] = 1
+            found[frame] = system.of_prior[frame] @ np.concatenate((-edges.ravel(), cameras.ravel()))
+        return found
 
     def retract(self, state: State, step: Step) -> State:
         """The state after a step. Whatever the step does not touch keeps its bits."""

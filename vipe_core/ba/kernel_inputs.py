@@ -49,7 +49,12 @@ class Robust(NamedTuple):
 
 
 class DepthPrior(NamedTuple):
-    """Value and information, (N, P), or (0, P) without a prior."""
+    """Value and information, (N, P), or (0, P) without a prior.
+
+    Where a frame's scale and shift of it are its own (`depth_prior.py`), value is with them; coupling (N, 2, P) is the
+    derivative of the information times value by both, zero for the one that is held, else (0, 2, P).
+    """
 
     value: Array
     weight: Array
+    coupling: Array

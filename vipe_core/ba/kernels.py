@@ -430,14 +430,16 @@ def linearise(
         offset: (N + 1,) where the frames begin in `eliminated`.
         eliminated: Flat float64 zeros: per frame with D edges and free depths, (6 D + 3 cameras)^2 numbers that
             eliminating the undamped depths subtracts; rows are the twists of the edges, then log f and alpha of every
-            camera and one more, which is the right-hand side of the first camera and zero of others.
+            camera and one more, which is the right-hand side of the first camera and zero of others. Where scale and
+            shift of the prior are a frame's own, they and one more row of zeros follow.
     """
     dtype = pose.rays.dtype
     most = 0
     for frame in range(begin, end):
         most = max(most, graph.first[frame + 1] - graph.first[frame])
     view, jacobian = np.zeros(_VIEW_SIZE, dtype), np.zeros(_JACOBIAN_SIZE, dtype)
-    tail, rows = TAIL * cameras, ROWS_APART if free[2] else ROWS
+    own = TAIL if len(prior.coupling) else 0
+    tail, rows = TAIL * cameras + own, ROWS_APART if free[2] else ROWS
     coupling = np.zeros((6 * most + tail) * TILE, dtype)
     curvature, pull = np.zeros(TILE, dtype), np.zeros(TILE, dtype)
     zero, one, tiny = dtype.type(0), dtype.type(1), dtype.type(_TINY)
@@ -454,6 +456,10 @@ def linearise(
                     coupling[p] = zero
                 for p in range(TILE):
                     coupling[(6 * degree + 2) * TILE + p] = pull[p]
+                for k in range(2 if own else 0):
+                    at = (6 * degree + TAIL * cameras + k) * TILE
+                    for p in range(n):
+                        coupling[at + p] = prior.coupling[frame, k, start + p]
             for order in range(first, last):
                 sums[frame, 2] += _see(graph, pose, frame, order, start, n, view)
                 cost, kept = _cost_sum(robust, scale, view, n)
@@ -473,7 +479,7 @@ def linearise(
                     out = coupling[r * TILE : (r + 1) * TILE]
                     for p in range(TILE):
                         out[p] *= curvature[p]
-                _gram(coupling, 2 * degree + cameras, TILE, eliminated, offset[frame])
+                _gram(coupling, size // 3, TILE, eliminated, offset[frame])
 
 
 @vectorised
@@ -546,6 +552,7 @@ def back_substitute(
     damping: Array,
     begin: int,
     end: int,
+    shift: Array,
     step: Array,
     gain: Array,
 ) -> None:
@@ -555,6 +562,7 @@ def back_substitute(
         twist: (E, 10) step of the twists of the edges in order, each with those of log f and alpha of its source's and
             its target's camera.
         damping: (1,) Levenberg-Marquardt damping.
+        shift: (N, 2) steps of scale and shift of the prior; (0, 2) where they are held.
         step: (N, P) filled where depths are free.
         gain: (N,) float64, filled with gradient times step.
     """
@@ -571,6 +579,10 @@ def back_substitute(
             _prior_pull(prior, pose.inverse_depth, frame, start, n, sums[TILE : 2 * TILE], sums[:TILE])
             for p in range(TILE):
                 sums[2 * TILE + p] = sums[TILE + p]
+            if len(shift):
+                by_scale, by_shift = prior.coupling[frame, 0][start:], prior.coupling[frame, 1][start:]
+                for p in range(n):
+                    sums[2 * TILE + p] += by_scale[p] * shift[frame, 0] + by_shift[p] * shift[frame, 1]
             for order in range(first, last):
                 _see(graph, pose, frame, order, start, n, view)
                 _reweigh(robust, scale, view, n)

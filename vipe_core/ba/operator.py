@@ -74,7 +74,7 @@ def _arguments(problem: Problem, state: State, options: Options) -> tuple[Any, .
         None if priors.inverse_depth_weight is None else priors.inverse_depth_weight.to(device),
         [] if log_focal is None else list(log_focal) if isinstance(log_focal, tuple) else [log_focal],
         priors.cam_from_rig,
-        priors.log_focal_sigma,
+        [priors.log_focal_sigma, priors.inverse_depth_scale_sigma, priors.inverse_depth_shift_sigma],
         priors.extrinsic_sigma,
         None if rig is None else rig.pose_of_frame.cpu(),
         None if rig is None else rig.view_of_frame.cpu(),
@@ -114,7 +114,7 @@ def _problem(
     prior_depth_weight: Tensor | None,
     prior_log_focal: Sequence[float],
     prior_cam_from_rig: Tensor | None,
-    prior_log_focal_sigma: float,
+    prior_sigmas: Sequence[float],
     prior_extrinsic_sigma: Tensor | None,
     pose_of_frame: Tensor | None,
     view_of_frame: Tensor | None,
@@ -140,9 +140,10 @@ def _problem(
             prior_depth,
             prior_depth_weight,
             None if not log_focal else log_focal[0] if len(log_focal) == 1 else log_focal,
-            prior_log_focal_sigma,
+            prior_sigmas[0],
             prior_cam_from_rig,
             prior_extrinsic_sigma,
+            *prior_sigmas[1:],
         ),
         None if pose_of_frame is None or view_of_frame is None else Rig(pose_of_frame, view_of_frame),
     )
@@ -166,7 +167,7 @@ _SCHEMA = (
     "(str camera_model, int[] grid_cells, float[] grid_px, Tensor? points_px, Tensor? points_count, Tensor source, "
     "Tensor target, Tensor target_px, Tensor weight, Tensor free_poses, Tensor free_depths, bool[] free, "
     "Tensor? prior_depth, Tensor? prior_depth_weight, float[] prior_log_focal, Tensor? prior_cam_from_rig, "
-    "float prior_log_focal_sigma, Tensor? prior_extrinsic_sigma, "
+    "float[] prior_sigmas, Tensor? prior_extrinsic_sigma, "
     "Tensor? pose_of_frame, Tensor? view_of_frame, Tensor cam_from_world, Tensor inverse_depth, Tensor intrinsics, "
     "Tensor? cam_from_rig, str robust, bool componentwise, int max_iterations, float? initial_scale_px, "
     "float[] settings) "

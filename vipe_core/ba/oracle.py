@@ -48,16 +48,21 @@ def newton_step(problem: Problem, state: State, options: Options, damping: float
     sources = torch.zeros(num_frames, dtype=torch.bool)
     sources[edges.source] = True
     bends = free.distortion and problem.camera_model == "mei"
+    # Scale and shift of each frame's prior.
+    priors = problem.priors
+    sigmas = torch.tensor([priors.inverse_depth_scale_sigma, priors.inverse_depth_shift_sigma], dtype=torch.float64)
+    own = (sigmas > 0) & (priors.inverse_depth is not None)
     moving = torch.cat(
         (
             (free_poses & touched).repeat_interleave(6),
             (seen_views & free.extrinsics).repeat_interleave(6),
             torch.tensor([free.focal] * num_cameras + [bends] * num_cameras),
             (free.inverse_depth & sources).repeat_interleave(num_cells),
+            (free.inverse_depth & sources).repeat_interleave(2) & own.repeat(num_frames),
         )
     )
-    sizes = [6 * num_poses, 6 * num_views, num_cameras, num_cameras, num_frames * num_cells]
-    num_shared = sum(sizes[:-1])
+    sizes = [6 * num_poses, 6 * num_views, num_cameras, num_cameras, num_frames * num_cells, 2 * num_frames]
+    num_shared = sum(sizes[:-2])
     sample_px = problem.grid.sample_px()
     if sample_px.ndim == 3:
         sample_px = sample_px[edges.source]
@@ -65,7 +70,7 @@ def newton_step(problem: Problem, state: State, options: Options, damping: float
     start = torch.zeros(len(moving), dtype=torch.float64)
 
     def unpack(update: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        twists, extrinsics, log_focal, alpha, depth = torch.split(update, sizes)
+        twists, extrinsics, log_focal, alpha, depth, _ = torch.split(update, sizes)
         views = se3.exp(extrinsics.reshape(num_views, 6)) @ cam_from_rig
         if rig is None:
             poses = se3.exp(twists.reshape(num_frames, 6)) @ state.cam_from_world
@@ -100,9 +105,11 @@ def newton_step(problem: Problem, state: State, options: Options, damping: float
     def weighted(update: Tensor) -> Tensor:
         rows = [(scale * measure(update)[0]).flatten()]
         _, views, params, depth = unpack(update)
-        priors = problem.priors
         if priors.inverse_depth is not None and priors.inverse_depth_weight is not None:
-            rows.append((priors.inverse_depth_weight.double().sqrt() * (depth - priors.inverse_depth)).flatten())
+            change = (fitted + update[-2 * num_frames :]).reshape(num_frames, 2)
+            value = change[:, :1] * priors.inverse_depth + change[:, 1:]
+            rows.append((priors.inverse_depth_weight.double().sqrt() * (depth - value)).flatten())
+            rows.append(((change - unbiased) / torch.where(own, sigmas, torch.inf)).flatten())
         if priors.log_focal is not None:
             log_focal = torch.tensor(priors.log_focal, dtype=torch.float64)
             rows.append((params[:, 0].log() - log_focal) / priors.log_focal_sigma)
@@ -110,6 +117,14 @@ def newton_step(problem: Problem, state: State, options: Options, damping: float
             rows.append(extrinsic_residual(views, priors).flatten())
         return torch.cat(rows)
 
+    # At the depths given, they are where they cost least.
+    unbiased = torch.tensor([1.0, 0.0], dtype=torch.float64)
+    fitted = unbiased.repeat(num_frames)
+    if own.any():
+        theirs = torch.zeros(len(moving), dtype=torch.bool)
+        theirs[-2 * num_frames :] = own.repeat(num_frames)
+        slope = torch.func.jacfwd(weighted)(start)[:, theirs]
+        fitted[own.repeat(num_frames)] -= torch.linalg.lstsq(slope, weighted(start)).solution
     jacobian = torch.func.jacfwd(weighted)(start)[:, moving]
     hessian = jacobian.T @ jacobian
     gradient = -jacobian.T @ weighted(start)
@@ -117,20 +132,20 @@ def newton_step(problem: Problem, state: State, options: Options, damping: float
     depths = torch.zeros_like(moving)
     depths[num_shared:] = True
     depths = depths[moving]
-    curvature = hessian.diagonal()[depths] * (1 + damping)
-    seen = curvature > 0
-    q = torch.where(seen, curvature, 1).reciprocal() * seen
+    private = hessian[depths][:, depths] * (1 + damping)
+    seen = private.diagonal() > 0
+    q = torch.linalg.inv(private + torch.diag((~seen).double())) * seen
     coupling = hessian[~depths][:, depths]
-    reduced = hessian[~depths][:, ~depths] - (coupling * q) @ coupling.T
+    reduced = hessian[~depths][:, ~depths] - coupling @ q @ coupling.T
     damped = reduced + damping * torch.diag(reduced.diagonal())
-    shared = torch.linalg.solve(damped, gradient[~depths] - coupling @ (q * gradient[depths]))
+    shared = torch.linalg.solve(damped, gradient[~depths] - coupling @ q @ gradient[depths])
     solution = torch.zeros_like(gradient)
     solution[~depths] = shared
-    solution[depths] = q * (gradient[depths] - coupling.T @ shared)
+    solution[depths] = q @ (gradient[depths] - coupling.T @ shared)
 
     update = start.clone()
     update[moving] = solution
-    twists, extrinsics, log_focal, alpha, depth = torch.split(update, sizes)
+    twists, extrinsics, log_focal, alpha, depth, _ = torch.split(update, sizes)
     pose = twists.reshape(num_poses, 6)[pose_of]
     if rig is not None:
         pose = (se3.adjoint(cam_from_rig)[view_of] @ pose[..., None])[..., 0]

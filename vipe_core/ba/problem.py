@@ -181,6 +181,9 @@ class Priors:
     Attributes:
         inverse_depth: (N, P) prior value, or None.
         inverse_depth_weight: (N, P) information of that prior; 0 where there is none.
+        inverse_depth_scale_sigma: Standard deviation of the factor that a frame's prior values have for themselves; 0
+            holds it at one.
+        inverse_depth_shift_sigma: Of what is added to them, 1 / world unit; 0 holds it at zero.
         log_focal: Prior of log(fx), or None. Where views have intrinsics of their own, of each of them, or one each.
         log_focal_sigma: Its standard deviation.
         cam_from_rig: (V, 4, 4) prior of the extrinsics, or None.
@@ -193,6 +196,8 @@ class Priors:
     log_focal_sigma: float = 1.0
     cam_from_rig: Tensor | None = None
     extrinsic_sigma: Tensor | None = None
+    inverse_depth_scale_sigma: float = 0.0
+    inverse_depth_shift_sigma: float = 0.0
 
     def __post_init__(self) -> None:
         if (self.cam_from_rig is None) != (self.extrinsic_sigma is None):

@@ -53,7 +53,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from vipe_core.ba import robust
+from vipe_core.ba import depth_prior, robust
+from vipe_core.ba.depth_prior import DepthPrior
 from vipe_core.ba.plan import Chunk, build_plan
 from vipe_core.ba.problem import Options, Points, Problem, State
 from vipe_core.ba.reprojection import cameras_of, median_inverse_depth, rays_of
@@ -100,11 +101,13 @@ class _View:
 @dataclass(frozen=True, slots=True)
 class _Eliminated:
     """Factors of a chunk's elimination: x (F, 6 D + n + 1, P), with n D more after the first 6 D where every view has
-    intrinsics of its own; root_q (F, P), adjoint (F, D, 6, 6)."""
+    intrinsics of its own; root_q (F, P), adjoint (F, D, 6, 6); of a prior with a scale or a shift of its own, k more
+    cells of x and of_prior (F, k, P), see `depth_prior.py`."""
 
     x: Tensor
     root_q: Tensor
     adjoint: Tensor
+    of_prior: Tensor | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -253,7 +256,7 @@ class TorchSolver:
         sums[2] += measured.max_weight.sum(-1).double().sum()
         prior = self._depth_prior(chunk, state)
         if chunk.depth_free and prior is not None:
-            sums[3] += (prior[0] * prior[1] * prior[1]).sum(-1).double().sum()
+            sums[3] += (prior.weight * prior.off * prior.off).sum(-1).double().sum() + prior.cost.sum()
 
     def _cost(self, sums: Tensor, state: State) -> Cost:
         priors, prior_cost = self.problem.priors, sums[3]
@@ -268,14 +271,8 @@ class TorchSolver:
     def _extrinsic_prior(self, state: State) -> tuple[Tensor, Tensor, Tensor] | None:
         return extrinsic_prior(self.problem.priors, state) if self.problem.free.extrinsics else None
 
-    def _depth_prior(self, chunk: Chunk, state: State) -> tuple[Tensor, Tensor] | None:
-        """Information (F, P) and prior minus state (F, P)."""
-        priors = self.problem.priors
-        if priors.inverse_depth is None or priors.inverse_depth_weight is None:
-            return None
-        weight = priors.inverse_depth_weight[chunk.frames].to(self.dtype)
-        value = torch.where(weight > 0, priors.inverse_depth[chunk.frames].to(self.dtype), 0)
-        return weight, value - state.inverse_depth[chunk.frames]
+    def _depth_prior(self, chunk: Chunk, state: State) -> DepthPrior | None:
+        return depth_prior.depth_prior(self.problem.priors, state.inverse_depth, chunk.frames)
 
     # -- normal equations ----------------------------------------------------------------------------------------
 
@@ -356,12 +353,13 @@ class TorchSolver:
         curvature = (by_depth * by_depth).sum(dim=(1, 2))
         prior = self._depth_prior(chunk, state)
         if prior is not None:
-            curvature += prior[0]
-            x[:, -1].addcmul_(prior[0], prior[1])
+            curvature += prior.weight
+            x[:, -1].addcmul_(prior.weight, prior.off)
         seen = curvature > torch.finfo(self.dtype).tiny
         root_q = torch.where(seen, curvature, 1).rsqrt().mul_(seen)
         x.mul_(root_q[:, None])
-        return _Eliminated(x, root_q, geometry.adjoint[chunk.edges])
+        x, of_prior = depth_prior.eliminate(prior, x, root_q)
+        return _Eliminated(x, root_q, geometry.adjoint[chunk.edges], of_prior)
 
     def linearise(self, state: State, scale_px: float) -> Linearisation:
         """The normal equations at a state."""
@@ -474,6 +472,10 @@ class TorchSolver:
             combination = torch.cat(parts, dim=1).to(self.dtype)
             scaled_step = (combination[:, None] @ factors.x)[:, 0].div_(1 + damping)
             predicted_drop = predicted_drop + (scaled_step * factors.x[:, -1]).sum(-1).double().sum()
+            if factors.of_prior is not None:
+                cells = depth.shape[1]
+                more = scaled_step[:, None, cells:] @ factors.of_prior
+                scaled_step = scaled_step[:, :cells] + more[:, 0]
             depth[chunk.frames] = scaled_step * factors.root_q
         shape = state.intrinsics.shape[:-1]
         log_focal, alpha = change[:, 0].reshape(shape), change[:, 1].reshape(shape)

@@ -22,12 +22,18 @@ import torch
 from vipe_core.ba.answer import Answer
 from vipe_core.ba.cuda.launcher import device_launcher
 from vipe_core.ba.cuda.solver import Adjustment, specialisation
+from vipe_core.ba.depth_prior import has_freedom
 from vipe_core.ba.problem import Options, Problem, State
 
 
 def takes(problem: Problem, state: State) -> bool:
-    """Whether the kernels are for a problem: single precision, and something measured."""
-    return state.inverse_depth.dtype == torch.float32 and len(problem.edges.source) > 0
+    """Whether the kernels are for a problem: single precision, something measured, no scales or shifts of depth priors.
+
+    Those of a frame depend on all of its depths, and a pass over the cells finishes the step of a tile's depths where
+    it already needs what the prior says of them.
+    """
+    measured = len(problem.edges.source) > 0
+    return state.inverse_depth.dtype == torch.float32 and measured and not has_freedom(problem.priors)
 
 
 def prepare(problem: Problem, state: State, options: Options) -> Adjustment | None:
