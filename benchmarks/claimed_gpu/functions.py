@@ -202,7 +202,8 @@ def _basic(gpu: ClaimedGpu, tensor: Tensor, index: Any) -> tuple[Tensor, list[Te
             indices.append(None)
             at += 1
         else:
-            view = view.select(at, int(one))
+            number = torch.ops.aten._local_scalar_dense(one) if isinstance(one, ClaimedTensor) else int(one)
+            view = view.select(at, number)
     return view, indices if any(one is not None for one in indices) else []
 
 

@@ -37,7 +37,7 @@ def residual_sigma_px(problem: Problem, state: State) -> float:
     below = weight[order].double().cumsum(0)
     if not below[-1] > 0:
         return math.nan
-    return math.sqrt(float(squared[torch.searchsorted(below, below[-1] / 2)])) / _RAYLEIGH_MEDIAN
+    return math.sqrt(float(squared[torch.searchsorted(below, below[-1:] / 2)])) / _RAYLEIGH_MEDIAN
 
 
 def robust_scale_px(

@@ -109,7 +109,9 @@ class DroidMatcher:
     def _between(self, pairs: Sequence[tuple[DroidFeatures, DroidFeatures]]) -> tuple[DroidRefinement, Tensor]:
         """A refinement of pairs that stand still, and (E, P, 2) where that sees the cells."""
         grid = pairs[0][0].grid
-        refinement = DroidRefinement(self._network, grid, lean=False)
+        # A volume of all pairs is worth its memory where it is looked up many times, and on a CPU, where a product of
+        # matrices is far faster than to gather features.
+        refinement = DroidRefinement(self._network, grid, lean=self._network.device.type != "cpu")
         still = grid.sample_px(torch.float32, self._network.device).expand(len(pairs), -1, -1)
         refinement.add(pairs, still)
         return refinement, still

@@ -9,6 +9,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from vipe_core.transfer import uploaded
+
 IMAGENET_MEAN, IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 
 
@@ -24,10 +26,10 @@ def normalised(
     Args:
         size: (width, height) to resize to, with smoothing where it is smaller.
     """
-    whole = torch.from_numpy(np.ascontiguousarray(rgb)).to(device).permute(2, 0, 1)[None].float() / 255
+    whole = uploaded(np.ascontiguousarray(rgb), device).permute(2, 0, 1)[None].float() / 255
     if (whole.shape[3], whole.shape[2]) != size:
         whole = torch.nn.functional.interpolate(whole, size=(size[1], size[0]), mode="bilinear", antialias=True)
-    shift, scale = (torch.tensor(values, device=device).view(1, 3, 1, 1) for values in (mean, std))
+    shift, scale = (uploaded(torch.tensor(values), device).view(1, 3, 1, 1) for values in (mean, std))
     return (whole - shift) / scale
 
 

@@ -19,6 +19,7 @@ from torch import Tensor
 from vipe_core.errors import EngineError
 from vipe_core.priors.hf.images import normalised
 from vipe_core.priors.hf.loading import network, transformers
+from vipe_core.transfer import uploaded
 
 Array = NDArray[Any]
 
@@ -95,9 +96,9 @@ class Sam2Propagation:
         session.cache = self._session.cache
         scale = np.array([self._side / self._size[0], self._side / self._size[1]] * 2)
         corners = torch.from_numpy(np.asarray(boxes_px * scale, np.float32)).view(-1, 1, 1, 2, 2)
-        labels = torch.tensor([[[_TOP_LEFT, _BOTTOM_RIGHT]]], dtype=torch.int32)
-        for row, box in enumerate(corners):
-            points = {"point_coords": box.to(self._device), "point_labels": labels.to(self._device)}
+        labels = uploaded(torch.tensor([[[_TOP_LEFT, _BOTTOM_RIGHT]]], dtype=torch.int32), self._device)
+        for row, box in enumerate(uploaded(corners, self._device)):
+            points = {"point_coords": box, "point_labels": labels}
             session.add_point_inputs(session.obj_id_to_idx(row), self._index, points)
             session.obj_with_new_inputs.append(row)
         self._outlined = session

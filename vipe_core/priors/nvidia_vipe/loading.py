@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from vipe_core.errors import ConfigError, LibraryMissing, WeightsInvalid, WeightsMissing
+from vipe_core.transfer import uploaded
 
 INSTALL = (
     "pip install 'vipe-cluster[nvidia-vipe]' && pip install --no-deps --no-build-isolation nvidia-vipe==1.2.0 (its"
@@ -105,4 +106,4 @@ def from_folder(kind: Any, folder: Path, device: torch.device) -> Any:
 
 def picture(rgb: NDArray[np.uint8], device: torch.device) -> Tensor:
     """(3, h, w) uint8 of a picture (h, w, 3)."""
-    return torch.from_numpy(np.ascontiguousarray(rgb)).to(device).permute(2, 0, 1)
+    return uploaded(np.ascontiguousarray(rgb), device).permute(2, 0, 1)
