@@ -7,7 +7,7 @@
 Inside, `torch.device("cuda")` works: tensors there refuse to be mixed with others, to be read by numpy and to be
 uploaded, read or counted while a graph is captured, as CUDA's do; half precision is rounded; what makes the host wait
 for the GPU is counted with the line of ours that asked for it. Graphs are recorded and really replayed. What is not
-there: asynchrony (a race between streams cannot show), speed, and limits of memory.
+there: asynchrony (a race between streams cannot show), speed, and limits of memory, which is only counted.
 """
 
 from __future__ import annotations

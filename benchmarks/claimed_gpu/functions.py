@@ -145,7 +145,7 @@ def _set_data(gpu: ClaimedGpu, func: Any, args: Sequence[Any], kwargs: dict[str,
         raise RuntimeError("a tensor cannot take the data of one on another device")
     func(*args)
     if isinstance(args[0], ClaimedTensor):
-        args[0].numbers = args[1].numbers
+        args[0].numbers, args[0].block = args[1].numbers, args[1].block
 
 
 def _get(gpu: ClaimedGpu, func: Any, args: Sequence[Any], kwargs: dict[str, Any]) -> Any:

@@ -11,6 +11,8 @@ from unittest.mock import patch
 
 import torch
 
+from benchmarks.claimed_gpu.tensor import MEMORY
+
 if TYPE_CHECKING:
     from benchmarks.claimed_gpu.machine import ClaimedGpu
 
@@ -83,7 +85,8 @@ def stand_ins(gpu: ClaimedGpu) -> Iterator[None]:
             raise RuntimeError("a graph is being captured already")
         gpu.recording = []
         try:
-            yield
+            with MEMORY.captured():
+                yield
             graph.steps = tuple(gpu.recording)
         finally:
             gpu.recording = None
@@ -112,8 +115,6 @@ def stand_ins(gpu: ClaimedGpu) -> Iterator[None]:
         "get_device_capability": _CAPABILITY,
         "get_device_properties": properties,
         "mem_get_info": (_MEMORY_BYTES, _MEMORY_BYTES),
-        "memory_allocated": 0,
-        "max_memory_allocated": 0,
         "memory_reserved": 0,
         "max_memory_reserved": 0,
         "current_stream": only,
@@ -126,7 +127,6 @@ def stand_ins(gpu: ClaimedGpu) -> Iterator[None]:
         "init",
         "_lazy_init",
         "empty_cache",
-        "reset_peak_memory_stats",
         "set_per_process_memory_fraction",
         "set_device",
         "manual_seed_all",
@@ -142,9 +142,13 @@ def stand_ins(gpu: ClaimedGpu) -> Iterator[None]:
         "device_of": chosen,
         "synchronize": synchronize,
         "set_sync_debug_mode": forbid,
+        "memory_allocated": lambda _=None: MEMORY.held_bytes,
+        "max_memory_allocated": lambda _=None: MEMORY.peak_bytes,
+        "reset_peak_memory_stats": lambda _=None: MEMORY.set_back(),
         **{name: _answering(answer) for name, answer in answers.items()},
         **{name: _answering(None) for name in quiet},
     }
+    MEMORY.begin()
     with ExitStack() as stack:
         for name, value in replaced.items():
             stack.enter_context(patch.object(torch.cuda, name, value))

@@ -7,21 +7,9 @@ Kernels are those of the tests' emulators, where there is a C++ compiler for the
 
 from __future__ import annotations
 
-import importlib
-import sys
-from pathlib import Path
-from typing import Any
-
 from benchmarks.claimed_gpu import claimed_gpu
+from benchmarks.claimed_gpu.emulated import emulators
 
-_TESTS = Path(__file__).parents[3] / "tests"
-sys.path += [str(_TESTS / "ba"), str(_TESTS / "priors")]
-_emulator: Any = importlib.import_module("cuda_emulator")
-_lookups: Any = importlib.import_module("lookup_emulator")
-_there = _emulator.COMPILER is not None
 # Kept, and never given back: the process ends with it.
-_claim = claimed_gpu(
-    (lambda kind: _emulator.EmulatedLauncher(kind, [kind])) if _there else None,
-    (lambda _: _lookups.EmulatedLookups()) if _there else None,
-)
+_claim = claimed_gpu(*emulators())
 _claim.__enter__()

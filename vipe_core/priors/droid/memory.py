@@ -13,8 +13,9 @@ from vipe_core.priors.droid.correlation import LEVELS, NUM_CHANNELS
 
 # Channels of an edge that live through an update: state, context, both inputs of the GRU and its gates.
 _LIVE_CHANNELS = 128 * 2 + 448 * 2 + 128 * 4
-# Channels of what a captured graph keeps beside that: its inputs, and an answer for each of a few numbers of edges.
-_CAPTURED_CHANNELS = 128 * 2 + NUM_CHANNELS + 8 * 128
+# Channels of what captured graphs keep beside that, for numbers of edges that are not captured yet need their own: the
+# inputs, what they work in, and an answer for each of a few numbers of edges. `benchmarks.gpu_memory` counts them.
+_CAPTURED_CHANNELS = 128 * 2 + NUM_CHANNELS + 4 + _LIVE_CHANNELS + 5 * 128
 # Features and context of a keyframe, and the copies of the features that products on the fly are made of.
 _KEYFRAME_CHANNELS = 128 * (3 + 7 / 3)
 # Source frames of a part of the global pass, and edges out of each.
