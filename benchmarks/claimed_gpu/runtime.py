@@ -101,6 +101,13 @@ def stand_ins(gpu: ClaimedGpu) -> Iterator[None]:
     def forbid(mode: int | str) -> None:
         gpu.forbidden = mode in (2, "error")
 
+    def bound(fraction: float, device: Any = None) -> None:
+        # As torch does: a device without a number is refused.
+        if device is not None and not isinstance(device, int) and torch.device(device).index is None:
+            raise ValueError(f"Expected a torch.device with a specified index or an integer, but got:{device}")
+        if not isinstance(fraction, float) or not 0 <= fraction <= 1:
+            raise ValueError(f"Invalid fraction value: {fraction}. Allowed range: 0~1")
+
     only = Stream()
     properties = SimpleNamespace(
         name=_NAME, total_memory=_MEMORY_BYTES, major=_CAPABILITY[0], minor=_CAPABILITY[1], multi_processor_count=132
@@ -127,7 +134,6 @@ def stand_ins(gpu: ClaimedGpu) -> Iterator[None]:
         "init",
         "_lazy_init",
         "empty_cache",
-        "set_per_process_memory_fraction",
         "set_device",
         "manual_seed_all",
         "set_rng_state",
@@ -142,6 +148,7 @@ def stand_ins(gpu: ClaimedGpu) -> Iterator[None]:
         "device_of": chosen,
         "synchronize": synchronize,
         "set_sync_debug_mode": forbid,
+        "set_per_process_memory_fraction": bound,
         "memory_allocated": lambda _=None: MEMORY.held_bytes,
         "max_memory_allocated": lambda _=None: MEMORY.peak_bytes,
         "reset_peak_memory_stats": lambda _=None: MEMORY.set_back(),

@@ -8,6 +8,7 @@ import torch
 from benchmarks.claimed_gpu import claimed_gpu
 from benchmarks.gpu_memory import _held, _refining
 from vipe_core.ba.problem import Grid
+from vipe_core.pipeline.device import limit_memory, resolve_device
 from vipe_core.priors.droid.memory import plan_memory
 
 pytestmark = pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
@@ -26,6 +27,15 @@ def test_bytes_are_counted_once_for_all_that_share_them_and_until_nobody_has_the
         del part, _
         assert torch.cuda.memory_allocated() == empty
         assert torch.cuda.max_memory_allocated() - empty == 2 * 4096
+
+
+@pytest.mark.parametrize("name", ["cuda", "cuda:0"])
+def test_a_process_is_held_to_its_part_of_a_gpu_however_that_is_named(name: str) -> None:
+    with claimed_gpu():
+        device = resolve_device(name)
+        assert device == torch.zeros(1, device=device).device
+        for size_bytes in (0, 10 << 30, 1 << 40):
+            limit_memory(device, size_bytes)
 
 
 def test_no_more_is_held_than_planned_and_not_much_less() -> None:

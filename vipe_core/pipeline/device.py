@@ -14,7 +14,7 @@ _OUT_OF_MEMORY = ("CUDA out of memory", "out of memory", "OUT_OF_MEMORY", "ALLOC
 
 
 def resolve_device(name: str) -> torch.device:
-    """The torch device called `name`: `cpu`, `cuda` or `cuda:N`.
+    """The torch device called `name`: `cpu`, `cuda` (the one that is current) or `cuda:N`.
 
     Raises:
         ConfigError: There is no such device here.
@@ -34,7 +34,8 @@ def resolve_device(name: str) -> torch.device:
         )
     if device.index is not None and device.index >= torch.cuda.device_count():
         raise ConfigError(f"device {name!r}: this machine has {torch.cuda.device_count()} GPU(s), counted from 0")
-    return device
+    # Tensors name their GPU by its number, and some of torch's functions want it.
+    return device if device.index is not None else torch.device("cuda", torch.cuda.current_device())
 
 
 def device_memory_bytes(device: torch.device) -> int | None:
