@@ -82,7 +82,7 @@ def rows(architecture: str) -> Iterable[tuple[str, Usage, list[str]]]:
     for kind in specialisations():
         camera = "unified" if kind.unified else "pinhole"
         free = "+".join(name for name, is_free in (("focal", kind.focal), ("alpha", kind.alpha)) if is_free) or "none"
-        cameras = " apart" if kind.apart else ""
+        cameras = (" apart" if kind.apart else "") + (" points" if kind.points else "")
         for name, used in usage(tile_source([kind]), architecture).items():
             yield f"{name} {camera} {free}{cameras} {kind.robust}", used, faults(name, used, kind)
 

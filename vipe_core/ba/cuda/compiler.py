@@ -61,9 +61,11 @@ class Specialisation:
     def resident_blocks(self) -> dict[str, int]:
         """Blocks of threads of each kernel that a multiprocessor should hold: at most 65536 / 128 / blocks registers
         per thread."""
+        tile, large = (3 if self.alpha else 4), 3
         if self.apart:
-            return dict.fromkeys(TILE_KERNELS, 2 if self.focal and self.alpha else 3)
-        return dict(zip(TILE_KERNELS, (3 if self.alpha or self.points else 4, 3), strict=True))
+            tile = large = 2 if self.focal and self.alpha else 3
+        # Where the cells of a frame end is one more thing to know.
+        return dict(zip(TILE_KERNELS, (min(tile, 3), 2) if self.points else (tile, large), strict=True))
 
     def definition(self, suffix: str = "") -> str:
         """The two kernels of this specialisation; their names end in `suffix`."""

@@ -19,12 +19,12 @@ ASSEMBLE_BLOCKS = 7
 
 _SIZES = (
     "num_frames num_edges num_cells width num_units num_slices num_nodes num_tail num_intrinsics num_blocks num_sides "
-    "unified focal_free alpha_free robust componentwise anything_free max_iterations has_prior scratch_stride "
+    "unified focal_free alpha_free robust anything_free max_iterations has_prior scratch_stride "
     "num_cameras apart num_views views_free has_view_prior num_pool"
 )
 _SETTINGS = (
     "stride offset robust_scale first_scale tolerance initial_damping min_damping min_depth_ratio "
-    "min_depth max_depth log_focal_information"
+    "min_depth max_depth log_focal_information components"
 )
 _ADDRESSES = (
     "points target_px weight prior_value prior_weight finite median largest prior_log_focal prior_view prior_sigma "

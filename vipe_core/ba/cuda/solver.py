@@ -188,7 +188,6 @@ class Adjustment:
             focal_free=focal_free,
             alpha_free=alpha_free,
             robust=CODE[options.robust],
-            componentwise=options.componentwise,
             anything_free=layout.num_nodes > 0 or focal_free or alpha_free or any_depth,
             max_iterations=options.max_iterations,
             has_prior=self._has_prior,
@@ -210,6 +209,7 @@ class Adjustment:
             min_depth=options.min_inverse_depth,
             max_depth=options.max_inverse_depth,
             log_focal_information=information,
+            components=1.0 + options.componentwise,
         )
         for name, tensor in self._tensors.items():
             setattr(context, name, tensor.data_ptr())

@@ -49,7 +49,7 @@ struct Context {
     i64 num_intrinsics;  // how many of these there are
     i64 num_blocks;   // 6x6 blocks of the reduced system
     i64 num_sides;    // tiles along a side of the factor
-    i64 unified, focal_free, alpha_free, robust, componentwise, anything_free, max_iterations;
+    i64 unified, focal_free, alpha_free, robust, anything_free, max_iterations;
     i64 has_prior;
     i64 scratch_stride;  // floats of `scratch` per block
     i64 num_cameras;     // with intrinsics of their own: 1, or the views of a rig
@@ -59,6 +59,7 @@ struct Context {
     i64 num_pool;        // blocks of `pool` in each of its parts
     double stride, offset, robust_scale, first_scale, tolerance, initial_damping, min_damping, min_depth_ratio;
     double min_depth, max_depth, log_focal_information;
+    double components;  // that the robust kernel judges each for itself: 2, or 1 where it judges their norm
 
     // The problem. Pixels and weights are (E, P, 2), in the order that they came in.
     const float* points;  // (N, P, 2) pixels of a frame's own instead of those of a grid, or none

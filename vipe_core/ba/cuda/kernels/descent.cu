@@ -24,7 +24,7 @@ __device__ inline void judge_at(const Context& c, Control& control, double measu
     control.prior = prior;
     // A lost measurement costs as much as a gross outlier, else losing them all would be best.
     const double scale = control.scale_next, mean = 4 * measured / weight;
-    const double outlier = (c.componentwise ? 2 : 1) * robust_cost((int)c.robust, scale, c.robust_scale, 100 * scale * scale);
+    const double outlier = c.components * robust_cost((int)c.robust, scale, c.robust_scale, 100 * scale * scale);
     control.lost_rho = outlier > mean ? outlier : mean;
 }
 
@@ -166,7 +166,7 @@ __device__ inline void sum_threads(double (&value)[N], double* shared) {
 }
 
 // judge: one block of threads. Whether the candidate is accepted, and what to do next.
-extern "C" __global__ void __launch_bounds__(WIDE_THREADS) judge(const Context c) {
+extern "C" __global__ void __launch_bounds__(WIDE_THREADS, 1) judge(const Context c) {
     __shared__ double shared[WIDE_THREADS];
     Control& control = *c.control;
     const int thread = threadIdx.x;

@@ -18,7 +18,7 @@ __device__ inline void largest_of_edge(const Context& c, float* rays, float* fou
                                                      ((const float2*)c.target_px)[row + cell],
                                                      ((const float2*)c.weight)[row + cell], inside);
         float squared = view.squared;
-        if (c.componentwise) squared = squared_u(view) > squared_v(view) ? squared_u(view) : squared_v(view);
+        if (c.components > 1) squared = squared_u(view) > squared_v(view) ? squared_u(view) : squared_v(view);
         most = squared > most ? squared : most;
     }
     found[thread] = most;
