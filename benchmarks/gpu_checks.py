@@ -9,6 +9,7 @@
     DROID built the extension of DROID's solver is compiled, where its source is given
     network     the DROID network against itself on the CPU; its kernels and graphs against their absence
     adapters    `python -m benchmarks.networks`, for the public networks whose libraries are installed
+    presets     `python -m benchmarks.gpu_presets`: tiny clips through the whole engine, against the CPU
     ba          `python -m benchmarks.ba`
     pipeline    `python -m benchmarks.gpu_pipeline`, with short clips
 
@@ -387,6 +388,7 @@ def sections(vipe: Path | None, droid: Path | None) -> list[list[Section]]:
     theirs = ["--vipe", str(vipe)] if vipe else []
     networks = [sys.executable, "-u", "-m", "benchmarks.networks", "--device", "cuda", *theirs]
     beside.append(Section("adapters", networks, 150, 3000))
+    beside.append(Section("presets", [sys.executable, "-u", "-m", "benchmarks.gpu_presets"], 150, 2000))
     if droid is not None:
         build = f"import torch, pathlib; Droid.load(pathlib.Path({str(droid)!r}), torch.device('cuda'))"
         command = [sys.executable, "-c", f"from benchmarks.peers.droid_ba import Droid; {build}"]
