@@ -21,6 +21,7 @@ from vipe_core.cameras import Camera
 from vipe_core.priors.protocols import PointFollower, TrackedPoints
 from vipe_core.slam.selection import Report, Selection
 from vipe_core.slam.working import WorkingSize
+from vipe_core.transfer import uploaded
 from vipe_core.video.source import FrameSource
 
 # A track that is further from the network's answer sees something else, or has slipped.
@@ -169,8 +170,6 @@ class EdgeTracks:
                 np.concatenate([edge.source_px for edge in self._edges]),
                 np.concatenate([edge.target_px for edge in self._edges]),
             )
-            row, cell, source_px, points_px = (
-                torch.from_numpy(part).to(self._device, non_blocking=True) for part in parts
-            )
+            row, cell, source_px, points_px = (uploaded(part, self._device) for part in parts)
             self._flat = row, cell, source_px, points_px
         return self._flat
