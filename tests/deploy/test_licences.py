@@ -12,7 +12,7 @@ def test_runtime_packages_are_welcome() -> None:
     assert len(packages) > 40
     assert [package for package in packages if not package.welcome] == []
     assert {package.name for package in packages} >= {"torch", "av", "ray", "psycopg-binary", "starlette"}
-    assert {package.name for package in packages}.isdisjoint({"plyfile"}), "GPL: for development only"
+    assert {package.name for package in packages}.isdisjoint({"evo", "plyfile"}), "GPL: for development only"
 
 
 def test_native_libraries_under_the_gpl_are_those_that_are_named() -> None:
