@@ -44,7 +44,7 @@ def with_own(problem: Problem, scale: float, shift: float) -> Problem:
     return replace(problem, priors=own)
 
 
-@settings(max_examples=6, deadline=None)
+@settings(max_examples=3, deadline=None)
 @given(
     st.sampled_from(["pinhole", "mei"]),
     st.sampled_from([(0.05, 0.0), (0.0, 0.1), (0.05, 0.1)]),
