@@ -10,24 +10,14 @@ from ba_scenes import disturbed, float32, scene, with_depth_prior, with_noise, w
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from rig_scenes import disturbed_rig, rig_scene
+from solver_steps import STEP, relative_error, torch_step
 
-from vipe_core.ba import Options, Problem, State, Step, cuda, newton_step, oracle, solve
+from vipe_core.ba import Options, Problem, State, cuda, newton_step, oracle, solve
 from vipe_core.ba.depth_prior import depth_prior
 from vipe_core.ba.host_solver import HostSolver
 from vipe_core.ba.torch_solver import TorchSolver
 from vipe_core.cameras import CameraModel
 from vipe_core.geometry import se3
-
-_STEP = ("pose", "log_focal", "alpha", "inverse_depth", "predicted_drop")
-
-
-def relative_error(actual: torch.Tensor, expected: torch.Tensor) -> float:
-    return float((actual - expected).norm() / expected.norm().clamp_min(1e-300))
-
-
-def torch_step(problem: Problem, state: State, options: Options, damping: float) -> Step:
-    solver = TorchSolver(problem, options, state)
-    return solver.step(solver.linearise(state, options.robust_scale_px), damping)
 
 
 def flickering(problem: Problem, truth: State, by: float, seed: int, information: float) -> Problem:
@@ -65,7 +55,7 @@ def test_a_step_is_the_oracles(model: CameraModel, sigmas: tuple[float, float], 
     for damping in (1e-3, 1.0):
         expected = oracle.newton_step(problem, state, options, damping)
         for actual in (newton_step(problem, state, options, damping), torch_step(problem, state, options, damping)):
-            for name in _STEP:
+            for name in STEP:
                 assert relative_error(getattr(actual, name), getattr(expected, name)) < 1e-8, name
 
 

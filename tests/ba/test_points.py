@@ -10,22 +10,12 @@ from ba_scenes import disturbed, float32, scene, with_depth_prior, with_noise, w
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from rig_scenes import disturbed_rig, rig_scene
+from solver_steps import STEP, relative_error, torch_step
 
-from vipe_core.ba import Grid, Options, Points, Problem, State, Status, Step, newton_step, oracle, residuals, solve
+from vipe_core.ba import Grid, Options, Points, Status, newton_step, oracle, residuals, solve
 from vipe_core.ba.host_solver import HostSolver
 from vipe_core.ba.torch_solver import TorchSolver
 from vipe_core.cameras import CameraModel
-
-_STEP = ("pose", "log_focal", "alpha", "inverse_depth", "predicted_drop")
-
-
-def relative_error(actual: torch.Tensor, expected: torch.Tensor) -> float:
-    return float((actual - expected).norm() / expected.norm().clamp_min(1e-300))
-
-
-def torch_step(problem: Problem, state: State, options: Options, damping: float) -> Step:
-    solver = TorchSolver(problem, options, state)
-    return solver.step(solver.linearise(state, options.robust_scale_px), damping)
 
 
 @settings(max_examples=5, deadline=None)
@@ -46,7 +36,7 @@ def test_a_step_is_the_oracles(model: CameraModel, alone: bool, own_cameras: boo
     options = Options(robust_scale_px=0.5)
     expected = oracle.newton_step(problem, state, options, 1e-3)
     for actual in (newton_step(problem, state, options, 1e-3), torch_step(problem, state, options, 1e-3)):
-        for name in _STEP:
+        for name in STEP:
             assert relative_error(getattr(actual, name), getattr(expected, name)) < 1e-8, name
 
 
@@ -54,7 +44,7 @@ def test_more_points_than_a_tile_are_the_torch_solvers() -> None:
     problem, truth = with_tracks(*scene("mei", 3, 3, 4, distortion_free=True), most=600)
     problem, state = with_noise(problem, 0.1), disturbed(truth, twist=2e-3, depth=0.02, log_focal=0.01)
     actual, expected = newton_step(problem, state, Options(), 1e-3), torch_step(problem, state, Options(), 1e-3)
-    for name in _STEP:
+    for name in STEP:
         assert relative_error(getattr(actual, name), getattr(expected, name)) < 1e-9, name
 
 

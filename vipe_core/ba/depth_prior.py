@@ -24,6 +24,7 @@ import torch
 from torch import Tensor
 
 from vipe_core.ba.problem import Priors
+from vipe_core.transfer import uploaded
 
 
 class DepthPrior(NamedTuple):
@@ -69,8 +70,8 @@ def depth_prior(priors: Priors, inverse_depth: Tensor, frames: Tensor | slice) -
         if sigma > 0
     ]
     basis = torch.stack([rows for rows, _, _ in said], dim=1)
-    information = basis.new_tensor([sigma**-2 for _, sigma, _ in said])
-    expected = basis.new_tensor([mean for _, _, mean in said])
+    information = uploaded(torch.tensor([sigma**-2 for _, sigma, _ in said], dtype=torch.float64), basis.device)
+    expected = uploaded(torch.tensor([mean for _, _, mean in said], dtype=torch.float64), basis.device)
     coupling = basis * weight[:, None]
     curvature = coupling @ basis.mT + torch.diag(information)
     held = 0 if priors.inverse_depth_scale_sigma > 0 else value

@@ -16,8 +16,8 @@ import torch
 
 from vipe_core.cameras import Camera
 from vipe_core.errors import ConfigError, LibraryMissing
+from vipe_core.priors.points import bounded_size, visible
 from vipe_core.priors.protocols import TrackedPoints
-from vipe_core.priors.visible import visible
 from vipe_core.video.source import Frame
 
 INSTALL = (
@@ -25,8 +25,6 @@ INSTALL = (
     " and later) and install it with pip"
 )
 
-# Longest side that is worth the time: the map is of about 640 x 480 pixels.
-_LONGEST_PX = 1280
 # Frames of slow videos are far apart in time; that is no reason to give up.
 _MAX_STEP_S = 3600.0
 
@@ -62,8 +60,7 @@ class CuvslamFollower:
         return cls(library, device)
 
     def input_size(self, width: int, height: int) -> tuple[int, int]:
-        scale = min(1.0, _LONGEST_PX / max(width, height))
-        return round(width * scale), round(height * scale)
+        return bounded_size(width, height)
 
     def follow(self, frames: Iterable[Frame], camera: Camera) -> Iterator[TrackedPoints]:
         """See `PointFollower`. A bent lens is given as the pinhole of its focal length: only its tracks are used."""

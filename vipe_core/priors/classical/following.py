@@ -1,4 +1,7 @@
-"""Corners followed from frame to frame: Shi-Tomasi corners, pyramidal Lucas-Kanade both ways."""
+"""Corners followed through consecutive frames: Shi-Tomasi corners, pyramidal Lucas-Kanade both ways.
+
+They are looked for in the frame in which most of them began, so that errors do not add up with every frame.
+"""
 
 from __future__ import annotations
 
@@ -9,16 +12,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vipe_core.cameras import Camera
-from vipe_core.priors.classical.features import Array, length_px
+from vipe_core.priors.classical.features import length_px
+from vipe_core.priors.classical.lucas_kanade import lucas_kanade
+from vipe_core.priors.points import bounded_size, visible
 from vipe_core.priors.protocols import TrackedPoints
-from vipe_core.priors.visible import visible
 from vipe_core.video.source import Frame
 
 _WINDOW = (15, 15)
 _LEVELS = 3
-_TERMINATION = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 20, 0.01)
-# Longest side that is worth the time: the map is of about 640 x 480 pixels.
-_LONGEST_PX = 1280
 # New corners are looked for when fewer than this share of them is left.
 _REFILL = 0.8
 
@@ -28,7 +29,8 @@ class CornerFollower:
 
     Args:
         most: Points followed at once.
-        max_return_px: A point that is not found again within this distance, back in the frame before, is lost.
+        max_return_px: A point that is not found again this close to where it was, back in the frame that it is followed
+            from, is lost.
     """
 
     def __init__(self, most: int = 600, max_return_px: float = 0.5) -> None:
@@ -36,8 +38,7 @@ class CornerFollower:
         self._max_return_px = max_return_px
 
     def input_size(self, width: int, height: int) -> tuple[int, int]:
-        scale = min(1.0, _LONGEST_PX / max(width, height))
-        return round(width * scale), round(height * scale)
+        return bounded_size(width, height)
 
     def follow(self, frames: Iterable[Frame], camera: Camera) -> Iterator[TrackedPoints]:
         """See `PointFollower`; the camera makes no difference."""
@@ -49,8 +50,8 @@ class CornerFollower:
             gray = np.asarray(cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY), np.uint8)
             if anchor is not None and len(ids):
                 # What moves goes on as it did for a frame; the way back begins where the point is known to be.
-                there, found = _moved(anchor, gray, begun_px, points_px + steps_px)
-                back, returned = _moved(gray, anchor, there, begun_px)
+                there, found = lucas_kanade(anchor, gray, begun_px, points_px + steps_px, _WINDOW, _LEVELS)
+                back, returned = lucas_kanade(gray, anchor, there, begun_px, _WINDOW, _LEVELS)
                 kept = found & returned & (length_px(back - begun_px) < self._max_return_px)
                 kept &= visible(there, (gray.shape[0], gray.shape[1]), frame.masked)
                 steps_px = (there - points_px)[kept]
@@ -75,20 +76,3 @@ class CornerFollower:
             cv2.circle(free, (x, y), int(apart_px), 0, -1)
         found = cv2.goodFeaturesToTrack(gray, self._most - len(known_px), 0.005, apart_px, mask=free)
         return np.zeros((0, 2), np.float32) if found is None else np.asarray(found[:, 0], np.float32)
-
-
-def _moved(
-    source: NDArray[np.uint8], target: NDArray[np.uint8], points: Array, start: Array
-) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-    moved, status, _ = cv2.calcOpticalFlowPyrLK(
-        source,
-        target,
-        np.ascontiguousarray(points, np.float32)[:, None],
-        np.ascontiguousarray(start, np.float32)[:, None].copy(),
-        winSize=_WINDOW,
-        maxLevel=_LEVELS,
-        criteria=_TERMINATION,
-        flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
-        minEigThreshold=1e-4,
-    )
-    return np.asarray(moved[:, 0]), np.asarray(status[:, 0] > 0)

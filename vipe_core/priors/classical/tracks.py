@@ -18,9 +18,10 @@ from vipe_core.priors.classical.features import (
     length_px,
     sample_px,
 )
+from vipe_core.priors.classical.lucas_kanade import lucas_kanade
 from vipe_core.priors.protocols import Match
 
-_TERMINATION = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 20, 0.01)
+_LEVELS = 1
 
 
 class LkTracker:
@@ -58,8 +59,8 @@ class LkTracker:
         corners, flow, smooth = self._corners_with_flow(source, displacement, larger(dense.weight) > 0)
         if not len(corners):
             return Match(dense.target_px.copy(), np.zeros((num_cells, 2), np.float32), 0.0)
-        forward, kept_forward = self._track(source.gray, target.gray, corners, corners + flow)
-        back, kept_back = self._track(target.gray, source.gray, forward, corners)
+        forward, kept_forward = lucas_kanade(source.gray, target.gray, corners, corners + flow, self._window, _LEVELS)
+        back, kept_back = lucas_kanade(target.gray, source.gray, forward, corners, self._window, _LEVELS)
         error = length_px(back - corners)
         correction = forward - corners - flow
         height, width = target.gray.shape
@@ -100,19 +101,3 @@ class LkTracker:
         limit = 1.5 + 0.1 * length_px(field)
         calm = (larger(spread) < limit) & known.reshape(grid.height, grid.width)
         return corners, flow, sample_px(calm.astype(np.float32), at_cells) > 0.5
-
-    def _track(
-        self, source: Array, target: Array, points: Array, start: Array
-    ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-        moved, status, _ = cv2.calcOpticalFlowPyrLK(
-            source,
-            target,
-            np.ascontiguousarray(points, np.float32)[:, None],
-            np.ascontiguousarray(start, np.float32)[:, None].copy(),
-            winSize=self._window,
-            maxLevel=1,
-            criteria=_TERMINATION,
-            flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
-            minEigThreshold=1e-4,
-        )
-        return np.asarray(moved[:, 0]), np.asarray(status[:, 0] > 0)

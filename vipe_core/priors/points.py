@@ -1,4 +1,4 @@
-"""Which points of a picture may be used."""
+"""What all that follow points through a video share."""
 
 from __future__ import annotations
 
@@ -6,6 +6,15 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+# Longest side that is worth the time: the map is of about 640 x 480 pixels.
+_LONGEST_PX = 1280
+
+
+def bounded_size(width: int, height: int) -> tuple[int, int]:
+    """(width, height) at which pictures of that size are followed in."""
+    scale = min(1.0, _LONGEST_PX / max(width, height))
+    return round(width * scale), round(height * scale)
 
 
 def visible(
